@@ -50,7 +50,7 @@ class DensifyReport:
 
 
 def screen_statistics(splats: Splats) -> dict[str, Tensor]:
-    """Fresh statistics for every splat."""
+    """Fresh statistics for every editable splat."""
     return {name: splats.parameters["means"].new_zeros(len(splats)) for name in STATISTICS}
 
 
@@ -65,13 +65,15 @@ def observe(splats: Splats, render: Render, loss_scale: float = 1.0) -> None:
     grad = render.means2d.grad
     if grad is None or not torch.isfinite(grad).all():
         return
+    first = grad.shape[1] - len(splats)  # editable splats stand last
+    grad, radii = grad[:, first:], render.radii[:, first:]
     views, height, width = render.rgb.shape[:3]
     half = grad.new_tensor([width / 2, height / 2])
-    size = (grad * half).norm(dim=-1) * (views / loss_scale)  # [V,N]
-    seen = render.radii > 0
+    size = (grad * half).norm(dim=-1) * (views / loss_scale)  # [V,E]
+    seen = radii > 0
     splats.state["grad_sum"] += (size * seen).sum(0)
     splats.state["grad_count"] += seen.sum(0).to(size.dtype)
-    splats.state["max_radius"] = torch.maximum(splats.state["max_radius"], render.radii.amax(0).to(size.dtype))
+    splats.state["max_radius"] = torch.maximum(splats.state["max_radius"], radii.amax(0).to(size.dtype))
 
 
 def select(gradient: Tensor, config: DensifyConfig, room: int) -> Tensor:
@@ -104,11 +106,11 @@ def split_children(scene: Gaussians, generator: torch.Generator) -> dict[str, Te
 def densify(splats: Splats, config: DensifyConfig, extent: float, generator: torch.Generator) -> DensifyReport:
     """Clone, split and prune once, and start the statistics anew. extent: the scene's size in world units.
     Raises SceneError, and changes nothing, where no splat would be left."""
-    scene, state = splats.scene.detach(), splats.state
+    scene, state = splats.edited.detach(), splats.state
     gradient = state["grad_sum"] / state["grad_count"].clamp(min=1)
     largest = scene.scales.amax(-1)
     faint = scene.opacities < config.min_opacity
-    room = config.max_splats - len(splats) + int(faint.sum())
+    room = config.max_splats - splats.total + int(faint.sum())
     chosen = select(torch.where(faint, 0.0, gradient), config, room)
     small = largest <= config.dense_size * extent
     clone, split = chosen & small, chosen & ~small

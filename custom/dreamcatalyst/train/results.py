@@ -77,7 +77,7 @@ def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]])
     summary = {
         "step": system.true_global_step,
         "seconds": round(system.seconds, 2),
-        "splats": len(system.splats),
+        "splats": system.splats.total,
         "held_out": [system.capture.views[i].name for i in scores],
         "mean": {name: value if math.isfinite(value) else None for name, value in mean.items()},  # JSON has no infinity
     }
@@ -109,4 +109,4 @@ def write_all(system: SplatSystem, scores: Mapping[int, Mapping[str, float]]) ->
     log_scores(system, scores, "test")
     for path in written:
         print(f"wrote {path}", flush=True)
-    plugin.info(f"{len(system.splats)} splats after {step} steps, {system.seconds:.1f} s")
+    plugin.info(f"{system.splats.total} splats after {step} steps, {system.seconds:.1f} s")

@@ -240,7 +240,7 @@ class SplatSystem(plugin.BaseSystem):
     def progress_metrics(self) -> dict[str, float]:
         """What the progress bar shows besides step and speed."""
         known = {"loss": self._numbers["loss"]} if "loss" in self._numbers else {}
-        return {**known, "splats": len(self.splats)}
+        return {**known, "splats": self.splats.total}
 
     # --- measuring
 
@@ -259,7 +259,7 @@ class SplatSystem(plugin.BaseSystem):
         self._pause()
         held_out = self.data.held_out
         chosen = held_out[:: max(1, len(held_out) // max(self.part["report"].views, 1))][: self.part["report"].views]
-        row = {"step": step, "seconds": round(seconds, 3), "splats": len(self.splats), **self._numbers}
+        row = {"step": step, "seconds": round(seconds, 3), "splats": self.splats.total, **self._numbers}
         self.curve.add(**row, **results.mean_scores([self.score(i) for i in chosen]))
         if running:
             self._started = time.perf_counter()
