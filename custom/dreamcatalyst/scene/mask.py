@@ -1,0 +1,95 @@
+"""Which splats an edit may touch: weights [N] from what views say of them, and masks from weights.
+
+Distances are in world units.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import SceneError
+
+FAINTEST = 1e-3  # the least update that a splat of a feathered mask gets: none is frozen by its own mask
+
+
+def soft_weights(
+    means: Tensor, inside: Tensor, total: Tensor, *, min_evidence: float = 0.5, neighbours: int = 8
+) -> Tensor:
+    """inside / total [N] in [0,1] where at least `min_evidence` (pixels) of a splat is seen over all views.
+
+    Splats of which less is seen are undecided, whatever their ratio: they take the mean weight of the `neighbours`
+    nearest decided ones, weighted by inverse distance. means [N,3]; inside, total [N] as of render/lift.py.
+    Raises SceneError where no splat is decided.
+    """
+    decided = total >= min_evidence
+    count = int(decided.sum())
+    if count == 0:
+        most = float(total.max()) if len(total) else 0.0
+        raise SceneError(
+            f"mask: of none of {len(total)} splats at least min_evidence={min_evidence:g} pixels are seen in the "
+            f"masked views (at most {most:.3g}). Do these cameras look at these splats?"
+        )
+    weights = (inside / total.clamp_min(torch.finfo(total.dtype).tiny)).clamp(0, 1)
+    if count == len(total):
+        return weights
+    distances, nearest = _nearest(means[decided], means[~decided], min(neighbours, count))
+    nearness = 1 / np.maximum(distances, 1e-12)
+    votes = weights[decided].cpu().double().numpy()[nearest]
+    weights[~decided] = torch.from_numpy((nearness * votes).sum(axis=1) / nearness.sum(axis=1)).to(weights)
+    return weights.clamp(0, 1)
+
+
+def threshold(weights: Tensor, level: float = 0.5) -> Tensor:
+    """Splats whose weight is at least `level`, bool [N]. Raises SceneError where there is none, which says what other
+    levels would find."""
+    mask = weights >= level
+    if not bool(mask.any()):
+        others = ", ".join(f"{int((weights >= level * part).sum())} at {level * part:.3g}" for part in (0.75, 0.5, 0.25))
+        highest = float(weights.max()) if len(weights) else 0.0
+        raise SceneError(
+            f"mask: is empty: threshold {level:g} finds 0 of {len(weights)} splats ({others}; the highest weight is "
+            f"{highest:.3g}). Lower mask.threshold, or look at the 2D masks"
+        )
+    return mask
+
+
+def invert(mask: Tensor) -> Tensor:
+    """Everything else, bool [N]. Raises SceneError where nothing else is left."""
+    if bool(mask.all()):
+        raise SceneError(f"mask: all {len(mask)} splats are in it, so that its inverse is empty. Set mask.invert=false")
+    return ~mask
+
+
+def grow(means: Tensor, mask: Tensor, distance: float) -> Tensor:
+    """The mask and every splat whose centre is at most `distance` from a masked one, bool [N]. means [N,3]."""
+    if distance <= 0 or not bool(mask.any()) or bool(mask.all()):
+        return mask
+    found, _ = _nearest(means[mask], means[~mask], 1)
+    grown = mask.clone()
+    grown[~mask] = torch.from_numpy(found[:, 0] <= distance).to(mask.device)
+    return grown
+
+
+def feather(means: Tensor, mask: Tensor, width: float) -> Tensor:
+    """How much of its update each splat takes, [N]: 0 outside of the mask, and in it in (0,1], rising with the distance
+    to the nearest splat outside, to 1 at `width`. width 0, and a mask of all splats: 1 throughout the mask.
+
+    It scales the update, not the gradient: Adam divides a gradient by its own size, and would undo the scale.
+    """
+    update = mask.to(means.dtype)
+    if width <= 0 or not bool(mask.any()) or bool(mask.all()):
+        return update
+    found, _ = _nearest(means[~mask], means[mask], 1)
+    update[mask] = torch.from_numpy(found[:, 0] / width).to(update).clamp(FAINTEST, 1)
+    return update
+
+
+def _nearest(points: Tensor, queries: Tensor, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [Q,k] of `queries` [Q,3] to their k nearest `points` [P,3], and the numbers [Q,k] of those."""
+    from scipy.spatial import cKDTree
+
+    points, queries = (t.detach().cpu().double().numpy() for t in (points, queries))
+    distances, numbers = cKDTree(points).query(queries, k=[*range(1, k + 1)])
+    return distances, numbers
