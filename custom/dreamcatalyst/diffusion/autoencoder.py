@@ -122,4 +122,3 @@ def load_autoencoder(folder: Folder, tiny: str | None, dtype: torch.dtype) -> nn
             f"(madebyollin/taesd for SD 1.x and 2.x), or autoencoder=null."
         )
     return vae
-
