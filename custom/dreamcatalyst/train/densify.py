@@ -17,6 +17,7 @@ from ..errors import SceneError
 from ..render.api import Render
 from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
+from ..scene.generations import Generations
 
 STATISTICS = ("grad_sum", "grad_count", "max_radius")
 SPLIT_SHRINK = 1.6  # a split splat's two children have scales divided by this (3DGS: 0.8 * 2)
@@ -36,7 +37,7 @@ class DensifyConfig:
     min_opacity: float = 0.005  # more transparent ones are removed
     max_size: float = 0.1  # larger ones are removed; 0: never
     max_radius: float = 0.0  # pixels: ones that were drawn larger since the last time are removed; 0: never
-    max_splats: int = 1_000_000  # cap: the largest gradients go first, nothing is added beyond it
+    max_splats: int = 1_000_000  # cap on all, frozen ones too: the largest gradients go first, none is added beyond
     reset_every: int = 0  # steps between two opacity resets; 0: never
 
 
@@ -103,9 +104,20 @@ def split_children(scene: Gaussians, generator: torch.Generator) -> dict[str, Te
 
 
 @torch.no_grad()
-def densify(splats: Splats, config: DensifyConfig, extent: float, generator: torch.Generator) -> DensifyReport:
-    """Clone, split and prune once, and start the statistics anew. extent: the scene's size in world units.
-    Raises SceneError, and changes nothing, where no splat would be left."""
+def densify(
+    splats: Splats,
+    config: DensifyConfig,
+    extent: float,
+    generator: torch.Generator,
+    generations: Generations | None = None,
+) -> DensifyReport:
+    """Clone, split and prune the editable splats once, and start the statistics anew. extent: the scene's size in world
+    units. Children inherit all state of their parents, but are a new one of `generations`, if these are kept; anchors
+    and weights of all generations then move on, even where nothing was added.
+
+    All editable splats may go where frozen ones are left, since an object that fades away is a valid edit. Raises
+    SceneError, and changes nothing, where no splat at all would be left.
+    """
     scene, state = splats.edited.detach(), splats.state
     gradient = state["grad_sum"] / state["grad_count"].clamp(min=1)
     largest = scene.scales.amax(-1)
@@ -123,11 +135,15 @@ def densify(splats: Splats, config: DensifyConfig, extent: float, generator: tor
     clone &= ~gone
     cloned, halved = clone.nonzero()[:, 0], split.nonzero()[:, 0]
     parents, kept = torch.cat([cloned, halved, halved]), (~gone & ~split).nonzero()[:, 0]
-    if len(kept) + len(parents) == 0:
+    if splats.frozen is None and len(kept) + len(parents) == 0:
         raise SceneError("density control would remove every splat; lower system.densify.min_opacity")
     children = split_children(scene[halved], generator)
     changed = {name: torch.cat([getattr(scene, name)[cloned], value]) for name, value in children.items()}
+    if generations is not None:
+        changed |= generations.newborn(splats, parents, changed)
     splats.rearrange(kept, parents, changed)
+    if generations is not None:
+        generations.advance(splats)
     splats.state.update(screen_statistics(splats))
     return DensifyReport(len(cloned), len(halved), int(gone.sum()))
 
