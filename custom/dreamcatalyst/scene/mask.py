@@ -46,7 +46,8 @@ def threshold(weights: Tensor, level: float = 0.5) -> Tensor:
     levels would find."""
     mask = weights >= level
     if not bool(mask.any()):
-        others = ", ".join(f"{int((weights >= level * part).sum())} at {level * part:.3g}" for part in (0.75, 0.5, 0.25))
+        lower = [part * level for part in (0.75, 0.5, 0.25)]
+        others = ", ".join(f"{int((weights >= value).sum())} at {value:.3g}" for value in lower)
         highest = float(weights.max()) if len(weights) else 0.0
         raise SceneError(
             f"mask: is empty: threshold {level:g} finds 0 of {len(weights)} splats ({others}; the highest weight is "

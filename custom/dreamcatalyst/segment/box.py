@@ -1,0 +1,78 @@
+"""Masks given by numbers: a box or a sphere in the world, or a rectangle in one view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..errors import ConfigError, nearest
+from .api import MaskRequest, Segmenter
+
+FORMS = "low and high (a box), center and radius (a sphere), or view and window (a rectangle in one view)"
+
+
+@dataclass(frozen=True)
+class Box(Segmenter):
+    """Exactly one of three. Of a box and a sphere: the splats whose centres lie inside.
+
+    Of a rectangle: what is visible in it, no more. A splat's weight is the part of it, as far as that view sees it,
+    that lies in the rectangle; what the view does not see, behind the object or beside the picture, is decided by its
+    nearest neighbours that it does see. So background that shows between the object and the rectangle's corners is in.
+    """
+
+    low: tuple[float, float, float] | None = None  # corner of a box along the world's axes, world units
+    high: tuple[float, float, float] | None = None  # the opposite corner
+    center: tuple[float, float, float] | None = None  # of a sphere, world units
+    radius: float | None = None
+    view: str | None = None  # name or number of a view
+    window: tuple[float, float, float, float] | None = None  # left, top, right, bottom, from the upper left corner:
+    # pixels of the render, or fractions of its sides where none is over 1
+
+    def __post_init__(self) -> None:
+        pairs = (self.low, self.high), (self.center, self.radius), (self.view, self.window)
+        given = [pair for pair in pairs if pair != (None, None)]
+        if len(given) != 1 or None in given[0]:
+            names = [name for name in self.__dataclass_fields__ if getattr(self, name) is not None]
+            raise ConfigError(f"got {', '.join(names) or 'nothing'}, expected one of: {FORMS}.")
+        if self.low and not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ConfigError(f"low: {self.low} must lie below high, {self.high}, along each axis.")
+        if self.radius is not None and not self.radius > 0:
+            raise ConfigError(f"radius: got {self.radius}, expected more than 0.")
+        if self.window and not (0 <= self.window[0] < self.window[2] and 0 <= self.window[1] < self.window[3]):
+            raise ConfigError(f"window: got {self.window}, expected left < right and top < bottom, none below 0.")
+
+    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor] | Tensor:
+        means = request.scene.means.detach()
+        if self.low:
+            inside = (means >= means.new_tensor(self.low)) & (means <= means.new_tensor(self.high))
+            return inside.all(dim=1).to(means)
+        if self.center:
+            return ((means - means.new_tensor(self.center)).norm(dim=1) <= self.radius).to(means)
+        number = self.number(request)
+        return {number: self.rectangle(request.cameras[number].width, request.cameras[number].height)}
+
+    def number(self, request: MaskRequest) -> int:
+        """The view that is meant, of all in the capture: by name, or else by number."""
+        if self.view in request.names:
+            return list(request.names).index(self.view)
+        if self.view.isdecimal() and int(self.view) < len(request.names):
+            return int(self.view)
+        raise ConfigError(
+            f"system.mask.options.view: no view '{self.view}'.{nearest(self.view, request.names)} "
+            f"Known: the names of the {len(request.names)} views, or 0 to {len(request.names) - 1}."
+        )
+
+    def rectangle(self, width: int, height: int) -> Tensor:
+        """The window as a mask [height,width]; a pixel that is cut counts by the part that lies inside."""
+        left, top, right, bottom = self.window
+        if max(self.window) <= 1:
+            left, top, right, bottom = left * width, top * height, right * width, bottom * height
+        if left >= width or top >= height:
+            raise ConfigError(f"system.mask.options.window: {self.window} lies outside of the view, {width}x{height}.")
+        x, y = torch.arange(width, dtype=torch.float32), torch.arange(height, dtype=torch.float32)
+        columns = (torch.minimum(x + 1, x.new_tensor(right)) - torch.maximum(x, x.new_tensor(left))).clamp(0, 1)
+        rows = (torch.minimum(y + 1, y.new_tensor(bottom)) - torch.maximum(y, y.new_tensor(top))).clamp(0, 1)
+        return rows[:, None] * columns
