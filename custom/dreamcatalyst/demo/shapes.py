@@ -19,16 +19,24 @@ FLATNESS = 0.12  # thickness of a surface splat over its width
 
 @dataclass(frozen=True)
 class Light:
-    """One distant lamp and the light from everywhere. direction: towards the lamp (need not be of unit length)."""
+    """One distant lamp and the light from everywhere. direction: towards the lamp (need not be of unit length).
+
+    lamp, ambient: strengths. color: RGB of both, 1 for white.
+    """
 
     direction: tuple[float, float, float] = (0.5, 0.35, 0.8)
     lamp: float = 0.65
     ambient: float = 0.45
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def shade(self, normals: Tensor) -> Tensor:
         """Brightness [N] of surfaces with unit `normals` [N,3]; a wrapped cosine, so that no side is black."""
         towards = torch.nn.functional.normalize(torch.tensor(self.direction, dtype=normals.dtype), dim=0)
         return self.ambient + self.lamp * ((normals @ towards) * 0.5 + 0.5) ** 1.5
+
+    def lit(self, normals: Tensor) -> Tensor:
+        """The light [N,3] that surfaces with unit `normals` [N,3] send back where they are white."""
+        return self.shade(normals)[:, None] * normals.new_tensor(self.color)
 
 
 def sphere_points(n: int) -> Tensor:
@@ -45,6 +53,21 @@ def frames(normals: Tensor) -> Tensor:
     flipped = normals[:, 2] < -1 + 1e-6
     q[flipped] = q.new_tensor([0.0, 1.0, 0.0, 0.0])
     return torch.nn.functional.normalize(q, dim=-1)
+
+
+def facing(scene: Gaussians) -> Tensor:
+    """Unit normals [N,3] of flat splats: where their quaternions turn the z axis."""
+    w, x, y, z = torch.nn.functional.normalize(scene.quats, dim=-1).unbind(-1)
+    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+
+
+def turn(axis: str, degrees: float) -> Tensor:
+    """The rotation matrix [3,3] about the x, y or z axis, counterclockwise as seen from the axis' tip."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    out = torch.eye(3)
+    out[i, i], out[i, j], out[j, i], out[j, j] = c, -s, s, c
+    return out
 
 
 def surface(points: Tensor, normals: Tensor, widths: Tensor, colors: Tensor, opacity: float = 0.95) -> Gaussians:
@@ -88,6 +111,17 @@ def disc(center: Sequence[float], radius: float, n: int) -> tuple[Tensor, Tensor
     normals = points.new_tensor([0.0, 0, 1]).expand(n, 3)
     widths = points.new_full((n,), 0.5 * OVERLAP * radius * math.sqrt(math.pi / n))
     return points + torch.tensor(center, dtype=torch.float32), normals, widths
+
+
+def plane(center: Sequence[float], right: Sequence[float], up: Sequence[float], spacing: float) -> tuple[Tensor, ...]:
+    """Points, normals and widths of a rectangle: `right` and `up` lead from its centre to the middles of two sides;
+    its normal is right x up."""
+    center, right, up = (torch.tensor(v, dtype=torch.float32) for v in (center, right, up))
+    n, m = (max(2, round(2 * float(v.norm()) / spacing)) for v in (right, up))
+    a, b = torch.meshgrid((torch.arange(n) + 0.5) / n * 2 - 1, (torch.arange(m) + 0.5) / m * 2 - 1, indexing="ij")
+    points = center + a.reshape(-1, 1) * right + b.reshape(-1, 1) * up
+    normal = torch.nn.functional.normalize(torch.linalg.cross(right, up), dim=0)
+    return points, normal.repeat(n * m, 1), points.new_full((n * m,), 0.65 * OVERLAP * spacing)
 
 
 def dome(radius: float, n: int, lowest: float = -0.15) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from ..data.camera import Cameras, look_at
 from ..errors import choose
+from ..registry import Registry
 from ..scene.gaussians import Gaussians
 from .shapes import Light, disc, dome, ellipsoid, speckle, surface
 
@@ -31,34 +33,97 @@ BEAR = (
     ("pedestal", (0.06, 0.0, -0.04), (0.46, 0.42, 0.10)),
 )
 STONE = {"nose": 0.55, "eye": 0.35, "muzzle": 1.08, "pedestal": 0.8}  # brightness by part, of the stone's colour
-PARTS = ("floor", "sky", *dict.fromkeys(name for name, _, _ in BEAR))  # the numbers in the splats' extra "part"
+# What a splat can belong to; the splats' extra "part" is an index into this.
+PARTS = ("floor", "sky", *dict.fromkeys(name for name, _, _ in BEAR), "wall", "tree", "ball", "box", "pot", "plant")
+UPRIGHT = torch.eye(3)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """An ellipsoid of the scene. center [3] world units; radii [3] along its own axes, world units;
+    rotation [3,3]: from its own axes to the world's; rows: first and one past the last of its splats."""
+
+    name: str
+    center: Tensor
+    radii: Tensor
+    rotation: Tensor = field(default_factory=lambda: UPRIGHT)
+    rows: tuple[int, int] = (0, 0)
+
+    def local(self, points: Tensor) -> Tensor:
+        """Points [N,3] in the solid's own axes and radii: of length 1 on its surface."""
+        return (points - self.center) @ self.rotation / self.radii
+
+
+@dataclass(frozen=True)
+class Thing:
+    """What an instruction can name. name: as in the instruction ("bear statue"); rows: first and one past the last of
+    its splats; solids: what it is made of, where that matters to an edit."""
+
+    name: str
+    rows: tuple[int, int]
+    solids: tuple[Solid, ...] = ()
 
 
 @dataclass(frozen=True)
 class World:
-    """A made scene. scene: splats with the extra "part" [N] (an index into PARTS); cameras: V views of it; up: [3]."""
+    """A made scene. scene: splats with the extra "part" [N] (an index into PARTS); cameras: V views of it; up: [3];
+    light: what it is lit by; things: what instructions can name; seed: it was made from."""
 
     scene: Gaussians
     cameras: Cameras
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    light: Light = field(default_factory=Light)
+    things: tuple[Thing, ...] = ()
+    seed: int = 0
+
+    @property
+    def outdoors(self) -> bool:
+        """Whether there is a sky."""
+        return bool(part_mask(self.scene, "sky").any())
+
+    def thing(self, name: str) -> Thing:
+        """The thing called `name`. Raises ConfigError naming the nearest one of this world."""
+        known = {thing.name: thing for thing in self.things}
+        return known[choose("thing in this world", name, known)]
 
 
-def _part(name: str, scene: Gaussians) -> Gaussians:
+def label(name: str, scene: Gaussians) -> Gaussians:
+    """The same splats as part `name`."""
     return scene.with_extra(part=torch.full((len(scene),), float(PARTS.index(name))))
+
+
+def solids(rows: Sequence[tuple]) -> list[Solid]:
+    """Solids from rows of (name, centre, radii), as BEAR has them."""
+    return [Solid(name, torch.tensor(center), torch.tensor(radii)) for name, center, radii in rows]
+
+
+def carve(
+    parts: Sequence[Solid], stone: Tensor, seed: int, light: Light, spacing: float = 0.028
+) -> tuple[Gaussians, list[Solid]]:
+    """Ellipsoids of one speckled stone of colour [3]; the same solids with their rows, counted from 0."""
+    made, placed, first = [], [], 0
+    for part in parts:
+        fine = spacing * (0.55 if part.name in ("eye", "nose") else 0.8 if part.name in ("ear", "muzzle") else 1.0)
+        points, normals, widths = ellipsoid(part.center.tolist(), part.radii.tolist(), fine, part.rotation)
+        grain = 1 + speckle(points, seed, 0.18, 0.25) + speckle(points, seed + 1, 0.12, 0.07)
+        shade = light.lit(normals) * grain[:, None] * STONE.get(part.name, 1.0)
+        made.append(label(part.name, surface(points, normals, widths, stone * shade)))
+        placed.append(replace(part, rows=(first, first + len(points))))
+        first += len(points)
+    return Gaussians.cat(made), placed
+
+
+def statue(parts: Sequence[Solid], first: int) -> Thing:
+    """What "the bear statue" names among carved `parts` (all but the pedestal), where their splats begin at `first`."""
+    shifted = [
+        replace(part, rows=(part.rows[0] + first, part.rows[1] + first)) for part in parts if part.name != "pedestal"
+    ]
+    return Thing("bear statue", (shifted[0].rows[0], shifted[-1].rows[1]), tuple(shifted))
 
 
 def bear_statue(seed: int, spacing: float = 0.028, light: Light | None = None) -> Gaussians:
     """A bear of stone that sits on a pedestal: one ellipsoid per part, every splat labelled with its part."""
-    light = light or Light()
-    stone = torch.tensor([0.60, 0.56, 0.52])
-    made = []
-    for name, center, radii in BEAR:
-        fine = spacing * (0.55 if name in ("eye", "nose") else 0.8 if name in ("ear", "muzzle") else 1.0)
-        points, normals, widths = ellipsoid(center, radii, fine)
-        grain = 1 + speckle(points, seed, 0.18, 0.25) + speckle(points, seed + 1, 0.12, 0.07)
-        shade = light.shade(normals) * grain * STONE.get(name, 1.0)
-        made.append(_part(name, surface(points, normals, widths, stone * shade[:, None])))
-    return Gaussians.cat(made)
+    return carve(solids(BEAR), torch.tensor([0.60, 0.56, 0.52]), seed, light or Light(), spacing)[0]
 
 
 def surroundings(seed: int, light: Light | None = None) -> Gaussians:
@@ -77,7 +142,7 @@ def surroundings(seed: int, light: Light | None = None) -> Gaussians:
     zenith, horizon = torch.tensor([0.33, 0.52, 0.82]), torch.tensor([0.85, 0.87, 0.88])
     cloud = torch.sigmoid(speckle(points, seed + 4, 4.0, 3.5) - 0.5)[:, None] * 0.45
     sky = surface(points, normals, widths, (zenith * height + horizon * (1 - height)) * (1 - cloud) + 0.97 * cloud)
-    return Gaussians.cat([_part("floor", lawn), _part("sky", sky)])
+    return Gaussians.cat([label("floor", lawn), label("sky", sky)])
 
 
 def orbit(n: int, size: int, radius: float = 2.35, fov: float = 42.0, target: float = 0.46) -> Cameras:
@@ -93,15 +158,21 @@ def orbit(n: int, size: int, radius: float = 2.35, fov: float = 42.0, target: fl
 
 def statue_world(seed: int = 0, views: int = 32, size: int = 128) -> World:
     """The bear statue on its lawn, with `views` cameras of `size` x `size` pixels around it."""
-    return World(Gaussians.cat([surroundings(seed), bear_statue(seed)]), orbit(views, size))
+    light = Light()
+    around = surroundings(seed, light)
+    bear, parts = carve(solids(BEAR), torch.tensor([0.60, 0.56, 0.52]), seed, light)
+    things = (statue(parts, len(around)),)
+    return World(Gaussians.cat([around, bear]), orbit(views, size), light=light, things=things, seed=seed)
 
 
-WORLDS = {"statue": statue_world}
+WORLDS = Registry("demo scene", __package__)
+WORLDS.add("statue", statue_world)
+WORLDS.add("random", ".random_world:random_world")
 
 
 def make_world(name: str, where: str = "data.source", **options) -> World:
-    """The world called `name` (an entry of WORLDS). Raises ConfigError naming the nearest known one."""
-    return WORLDS[choose("demo scene", name, WORLDS, where)](**options)
+    """The world called `name` (registered in WORLDS). Raises ConfigError naming the nearest known one."""
+    return WORLDS.get(name, where)(**options)
 
 
 def part_mask(scene: Gaussians, *names: str) -> Tensor:

@@ -1,0 +1,181 @@
+"""Edits of one thing in a made world: coats and shapes of other bears, metals, paints. All else keeps its bits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..scene.gaussians import SH_C0, Gaussians
+from .shapes import facing, frames, speckle
+from .worlds import Solid, Thing, World
+
+Coat = Callable[[Thing, Solid, Tensor], Tensor]  # thing, its solid, points [n,3] in the world -> albedo [n,3]
+
+
+def colors_of(scene: Gaussians) -> Tensor:
+    """Plain colours [N,3] of splats without view dependence."""
+    return 0.5 + SH_C0 * scene.sh0[:, 0]
+
+
+def with_rows(scene: Gaussians, first: int, **fields: Tensor) -> Gaussians:
+    """`scene` with the rows from `first` on replaced in the named parameters; `colors` [n,3] stands for sh0."""
+    if "colors" in fields:
+        fields["sh0"] = ((fields.pop("colors").clamp(0, 1) - 0.5) / SH_C0)[:, None]
+    out = {}
+    for name, rows in fields.items():
+        out[name] = getattr(scene, name).clone()
+        out[name][first : first + len(rows)] = rows
+    return replace(scene, **out)
+
+
+def soft(x: Tensor, edge: float, width: float) -> Tensor:
+    """1 where x is well below `edge`, 0 well above, over about `width`; [n] -> [n,1]."""
+    return torch.sigmoid((edge - x) / width)[:, None]
+
+
+def _body(thing: Thing, name: str = "body") -> Solid:
+    return next(solid for solid in thing.solids if solid.name == name)
+
+
+def panda(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
+    """White; black are ears, the patches around the eyes, nose, limbs and the band over the shoulders."""
+    white, black = points.new_tensor([0.93, 0.92, 0.88]), points.new_tensor([0.07, 0.07, 0.08])
+    dark = points.new_zeros(len(points), 1)
+    if solid.name in ("ear", "eye", "nose", "arm", "leg"):
+        dark = dark + 1
+    elif solid.name in ("body", "belly"):
+        height = _body(thing).local(points)[:, 2]
+        dark = soft((height - 0.58).abs(), 0.22, 0.025)
+    elif solid.name == "head":
+        head = _body(thing, "head")
+        at = (points - head.center) @ head.rotation
+        for eye in (s for s in thing.solids if s.name == "eye"):
+            middle = (eye.center - head.center) @ head.rotation
+            away = at - middle
+            side = 1.0 if middle[1] > 0 else -1.0
+            out, up = side * away[:, 1] + 0.012, away[:, 2] + 0.012  # the patch hangs outwards and down
+            long, short = (out - up) * 0.7071, (out + up) * 0.7071
+            size = eye.radii[2] / 0.028
+            dark = torch.maximum(
+                dark,
+                soft(
+                    (long / 0.075).square() + (short / 0.052).square() + (away[:, 0] / 0.12).square(),
+                    1.0 * size * size,
+                    0.12,
+                ),
+            )
+    return white * (1 - dark) + black * dark
+
+
+def polar_bear(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
+    """Creamy white; nose and eyes black, the muzzle and inside of the ears a little greyer."""
+    color = {
+        "nose": (0.06, 0.06, 0.07),
+        "eye": (0.06, 0.05, 0.05),
+        "muzzle": (0.90, 0.87, 0.80),
+        "ear": (0.84, 0.80, 0.73),
+    }
+    return points.new_tensor(color.get(solid.name, (0.96, 0.94, 0.87))).expand(len(points), 3)
+
+
+def grizzly(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
+    """Brown, darker towards the paws, with a tan muzzle and lighter, grizzled shoulders."""
+    color = {
+        "nose": (0.06, 0.05, 0.05),
+        "eye": (0.05, 0.03, 0.02),
+        "muzzle": (0.66, 0.50, 0.33),
+        "ear": (0.30, 0.18, 0.09),
+    }
+    base = points.new_tensor(color.get(solid.name, (0.46, 0.28, 0.14))).expand(len(points), 3)
+    if solid.name in ("arm", "leg"):
+        paw = soft(solid.local(points)[:, 2 if solid.name == "arm" else 2], -0.1, 0.3)
+        base = base * (1 - paw) + points.new_tensor([0.25, 0.14, 0.07]) * paw
+    elif solid.name == "body":
+        hump = 1 - soft(solid.local(points)[:, 2], 0.55, 0.12)
+        base = base * (1 - hump) + points.new_tensor([0.60, 0.42, 0.24]) * hump
+    return base
+
+
+# Radii of the parts that differ, as factors (x forward, y sideways, z up in the part's own axes).
+PANDA_SHAPE = {
+    "ear": (1.15, 1.2, 1.2),
+    "muzzle": (0.85, 1.0, 1.0),
+    "belly": (1.06, 1.08, 1.0),
+    "head": (1.0, 1.06, 1.03),
+}
+POLAR_SHAPE = {"ear": (0.9, 0.75, 0.75), "muzzle": (1.3, 0.9, 0.95), "head": (1.04, 0.92, 0.95)}
+GRIZZLY_SHAPE = {
+    "ear": (1.0, 0.85, 0.85),
+    "muzzle": (1.15, 1.0, 1.0),
+    "body": (1.06, 1.06, 1.04),
+    "arm": (1.08, 1.1, 1.0),
+}
+SNOUT = {"panda": -0.015, "polar": 0.03, "grizzly": 0.015}
+
+
+def reshaped(solid: Solid, shape: dict[str, tuple[float, ...]]) -> Solid:
+    """`solid` with its radii scaled as `shape` says; the nose goes with the muzzle's tip."""
+    out = replace(solid, radii=solid.radii * solid.radii.new_tensor(shape.get(solid.name, (1.0, 1.0, 1.0))))
+    if solid.name in ("muzzle", "nose") and "muzzle" in shape:
+        reach = 0.06 * (shape["muzzle"][0] - 1) * (1.0 if solid.name == "muzzle" else 2.4)
+        out = replace(out, center=out.center + out.rotation @ out.center.new_tensor([reach, 0.0, 0.0]))
+    return out
+
+
+def dress(world: World, coat: Coat, shape: dict[str, tuple[float, ...]], thing: str = "bear statue") -> Gaussians:
+    """The world with `thing` in another coat and shape: each of its splats moves with its ellipsoid, in the world's
+    light, with the short fur's own speckle. As many splats, in the same order."""
+    bear, scene = world.thing(thing), world.scene
+    new = replace(bear, solids=tuple(reshaped(solid, shape) for solid in bear.solids))
+    for old, solid in zip(bear.solids, new.solids, strict=True):
+        first, last = old.rows
+        unit = old.local(scene.means[first:last])
+        normals = torch.nn.functional.normalize(unit / solid.radii, dim=-1) @ solid.rotation.T
+        points = (unit * solid.radii) @ solid.rotation.T + solid.center
+        fur = 1 + speckle(points, world.seed + 7, 0.07, 0.06)
+        colors = coat(new, solid, points) * world.light.lit(normals) * fur[:, None]
+        fields = dict(colors=colors)
+        if solid.name in shape or not torch.equal(old.center, solid.center):
+            grown = float((solid.radii / old.radii).log().mean())
+            fields |= dict(means=points, quats=frames(normals), log_scales=scene.log_scales[first:last] + grown)
+        scene = with_rows(scene, first, **fields)
+    return scene
+
+
+def ramp(x: Tensor, stops: tuple[tuple[float, float, float], ...]) -> Tensor:
+    """Colours [n,3] along `stops`, evenly spaced over x [n] in 0..1."""
+    table = x.new_tensor(stops)
+    at = x.clamp(0, 1) * (len(stops) - 1)
+    i = at.floor().long().clamp(max=len(stops) - 2)
+    part = (at - i)[:, None]
+    return table[i] * (1 - part) + table[i + 1] * part
+
+
+BRONZE = ((0.10, 0.06, 0.04), (0.30, 0.17, 0.09), (0.56, 0.34, 0.17), (0.80, 0.56, 0.32), (1.0, 0.88, 0.66))
+GOLD = ((0.20, 0.10, 0.02), (0.55, 0.34, 0.04), (0.86, 0.62, 0.10), (1.0, 0.83, 0.30), (1.0, 0.96, 0.72))
+
+
+def metal(world: World, thing: str, stops: tuple[tuple[float, float, float], ...]) -> Gaussians:
+    """The world with `thing` cast in metal: a steep ramp over its light, with the lamp's gleam; dark parts stay so."""
+    first, last = world.thing(thing).rows
+    rows = world.scene[slice(first, last)]
+    normals, brightness = facing(rows), colors_of(rows).mean(-1)
+    towards = torch.nn.functional.normalize(normals.new_tensor(world.light.direction), dim=0)
+    lit = world.light.shade(normals)
+    grain = brightness / (lit * (brightness / lit).median())  # 1 for the plain surface, less for eyes and joints
+    facing_lamp = (normals @ towards) * 0.5 + 0.5
+    x = 0.12 + 0.55 * facing_lamp**1.3 + 0.35 * facing_lamp**10
+    return with_rows(world.scene, first, colors=ramp(x * (0.35 + 0.65 * grain.clamp(0.2, 1.3)), stops))
+
+
+def paint(world: World, thing: str, color: tuple[float, float, float]) -> Gaussians:
+    """The world with `thing` painted: its own light and grain stay."""
+    first, last = world.thing(thing).rows
+    rows = world.scene[slice(first, last)]
+    brightness, lit = colors_of(rows).mean(-1), world.light.shade(facing(rows))
+    grain = brightness / (lit * (brightness / lit).median())
+    white = world.light.lit(facing(rows)) * (0.4 + 0.6 * grain.clamp(0.2, 1.3))[:, None]
+    return with_rows(world.scene, first, colors=white * white.new_tensor(color))

@@ -1,0 +1,229 @@
+"""The edits of made worlds, by name and by instruction, each with the truth in 3D."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from ..errors import choose
+from ..scene.gaussians import Gaussians
+from .coats import (
+    BRONZE,
+    GOLD,
+    GRIZZLY_SHAPE,
+    PANDA_SHAPE,
+    POLAR_SHAPE,
+    dress,
+    grizzly,
+    metal,
+    paint,
+    panda,
+    polar_bear,
+)
+from .seasons import autumn, night, snow, sunset
+from .worlds import World
+
+NOTHING = "nothing"  # the edit that leaves a world as it is
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One thing that can be asked for.
+
+    name: of the edit. scope: "object" (only the target changes) or "global". phrases: the instructions that ask for it,
+    the paper's wording first. target: the thing that changes, None for global ones. weight: how often training draws
+    it. apply: World -> Gaussians, as many splats in the same order. indoors: whether it makes sense in a room.
+    """
+
+    name: str
+    scope: str
+    phrases: tuple[str, ...]
+    apply: Callable[[World], Gaussians]
+    target: str | None = None
+    weight: float = 1.0
+    indoors: bool = True
+
+
+def _animal(name: str, article: str = "a") -> tuple[str, ...]:
+    it = f"{article} {name}"
+    return (
+        f"Turn the bear statue into {it}",
+        f"Make the bear statue {it}",
+        f"Turn the bear into {it}",
+        f"Turn the statue into {it}",
+        f"Turn it into {it}",
+        f"Make it {it}",
+        f"Make the bear look like {it}",
+        f"Change the bear statue to {it}",
+        f"Replace the statue with {it}",
+        f"It should be {it}",
+        it.capitalize(),
+        name.capitalize(),
+    )
+
+
+def _painted(thing: str, color: str) -> tuple[str, ...]:
+    short = {"bear statue": ("bear", "statue"), "flower pot": ("pot",)}.get(thing, ())
+    phrases = [f"Turn the {thing} {color}", f"Make the {thing} {color}", f"Paint the {thing} {color}"]
+    phrases += [f"Change the color of the {thing} to {color}", f"{color.capitalize()} {thing}", f"A {color} {thing}"]
+    for name in short:
+        phrases += [f"Turn the {name} {color}", f"Make the {name} {color}", f"Paint the {name} {color}"]
+    return tuple(phrases)
+
+
+PAINTS = {
+    "red": (0.78, 0.13, 0.11),
+    "blue": (0.14, 0.30, 0.76),
+    "green": (0.18, 0.55, 0.20),
+    "yellow": (0.92, 0.76, 0.14),
+    "purple": (0.48, 0.20, 0.62),
+    "white": (0.95, 0.94, 0.92),
+}
+THINGS = ("bear statue", "ball", "box", "flower pot")
+
+
+def _animals() -> list[Edit]:
+    bears = {
+        "panda": (panda, PANDA_SHAPE, ("Turn it into a panda bear", "Give the bear the fur of a panda"), 5.0),
+        "polar bear": (polar_bear, POLAR_SHAPE, ("Give the bear the fur of a polar bear",), 3.0),
+        "grizzly bear": (grizzly, GRIZZLY_SHAPE, ("Turn the statue into a brown bear", "Turn it into a grizzly"), 3.0),
+    }
+    return [
+        Edit(name, "object", _animal(name) + more, partial(dress, coat=coat, shape=shape), "bear statue", weight)
+        for name, (coat, shape, more, weight) in bears.items()
+    ]
+
+
+def _metals() -> list[Edit]:
+    bronze = _animal("bronze statue") + (
+        "Make the bear bronze",
+        "Make the statue out of bronze",
+        "Cast the bear in bronze",
+    )
+    made = [
+        Edit("bronze statue", "object", bronze, partial(metal, thing="bear statue", stops=BRONZE), "bear statue", 3.0)
+    ]
+    for thing in THINGS:
+        gold = _painted(thing, "golden") + (f"Make the {thing} gold", f"Turn the {thing} into gold")
+        gold += _animal("golden statue") if thing == "bear statue" else ()
+        weight = 2.0 if thing == "bear statue" else 0.3
+        made.append(Edit(f"golden {thing}", "object", gold, partial(metal, thing=thing, stops=GOLD), thing, weight))
+    return made
+
+
+def _paints() -> list[Edit]:
+    return [
+        Edit(
+            f"{color} {thing}",
+            "object",
+            _painted(thing, color),
+            partial(paint, thing=thing, color=rgb),
+            thing,
+            0.7 if thing == "bear statue" else 0.3,
+        )
+        for thing in THINGS
+        for color, rgb in PAINTS.items()
+    ]
+
+
+def _global(name: str, words: tuple[str, ...], more: tuple[str, ...], apply: Callable, indoors: bool) -> Edit:
+    phrases = [
+        f"{start} {word}"
+        for word in words
+        for start in ("Make it", "Turn it into", "Make it look like", "Make the scene")
+    ]
+    return Edit(name, "global", tuple(phrases) + more, apply, weight=2.2, indoors=indoors)
+
+
+def _table() -> dict[str, Edit]:
+    edits = [
+        *_animals(),
+        *_metals(),
+        *_paints(),
+        _global(
+            "sunset",
+            ("sunset", "a sunset"),
+            ("Make it look like it is sunset", "At sunset", "Sunset", "Change the time of day to sunset"),
+            sunset,
+            True,
+        ),
+        _global(
+            "autumn",
+            ("autumn", "fall"),
+            (
+                "Make it look like autumn has come",
+                "In autumn",
+                "Autumn",
+                "Change the season to autumn",
+                "Turn the leaves orange",
+            ),
+            autumn,
+            False,
+        ),
+        _global(
+            "snow",
+            ("winter",),
+            (
+                "Make it look like just snowed",
+                "Make it look like it just snowed",
+                "Make it snowy",
+                "Cover it with snow",
+                "Add snow",
+                "Snow",
+                "Change the season to winter",
+                "Let it snow",
+            ),
+            snow,
+            False,
+        ),
+        _global(
+            "night",
+            ("night", "night time"),
+            ("Make it midnight", "At night", "Night", "Change the time of day to night", "Make it dark"),
+            night,
+            True,
+        ),
+        Edit(
+            NOTHING,
+            "global",
+            ("", "Leave it as it is", "Change nothing", "Do nothing", "Keep it the same", "No change"),
+            lambda world: world.scene,
+            weight=1.5,
+        ),
+    ]
+    return {edit.name: edit for edit in edits}
+
+
+EDITS: dict[str, Edit] = _table()
+
+
+def normalised(instruction: str) -> str:
+    """`instruction` without case, punctuation and spare spaces."""
+    return " ".join(re.findall(r"[^\W_]+", instruction.casefold()))
+
+
+_BY_PHRASE = {normalised(phrase): edit for edit in EDITS.values() for phrase in edit.phrases}
+
+
+def find_edit(instruction: str) -> Edit | None:
+    """The edit that `instruction` asks for, whatever its case, punctuation and spaces; None where it is unknown."""
+    return _BY_PHRASE.get(normalised(instruction))
+
+
+def possible(world: World) -> list[Edit]:
+    """The edits that make sense in `world`: their target stands in it, and weather needs a sky."""
+    names = {thing.name for thing in world.things}
+    return [e for e in EDITS.values() if (e.target is None or e.target in names) and (e.indoors or world.outdoors)]
+
+
+def apply_edit(world: World, name: str) -> Gaussians:
+    """The scene of `world` after the edit called `name`: as many splats, in the same order, with the same labels.
+
+    Object edits leave all splats but their target's as they are, to the bit. Recolourings and global edits change sh0
+    alone, so that splats can be compared one by one; the animals also move and scale the splats of some parts (ears,
+    muzzle, trunk): those are compared by renders, which are exact from any viewpoint.
+    Raises ConfigError for an unknown name or where the target is not in this world.
+    """
+    return EDITS[choose("edit", name, EDITS)].apply(world)
