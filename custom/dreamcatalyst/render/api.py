@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,11 +11,13 @@ from ..data.camera import Cameras
 from ..errors import SceneError
 from ..registry import Registry
 from ..scene.gaussians import Gaussians
+from .frozen import Frozen
 
 BACKENDS = Registry("rasterizer backend", __package__)
 BACKENDS.add("reference", ".reference:rasterize")
 BACKENDS.add("cpu", ".cpu:rasterize")
 BACKENDS.add("gsplat", ".gsplat:rasterize")
+KEEPS = {"cpu"}  # backends that take `frozen` themselves, for colour alone; others are given all splats in one scene
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,8 @@ class Render:
     rgb [V,H,W,3] unclamped, over the background; alpha [V,H,W,1] in [0,1];
     depth [V,H,W,1] expected z of what is there (world units, 0 where alpha is 0), None unless asked for;
     features [V,H,W,F] composited like colour over zero, None unless given;
-    means2d [V,N,2] pixels: a node of the graph whose gradient drives densification (call retain_grad);
+    means2d [V,N,2] pixels: a node of the graph whose gradient drives densification (call retain_grad). Beside frozen
+    splats it may be a leaf that only receives that gradient;
     radii [V,N] int32 pixels, 0 where the splat is not drawn.
     """
 
@@ -47,6 +50,7 @@ def rasterize(
     depth: bool = False,
     antialiased: bool = False,
     backend: str = "auto",
+    frozen: Frozen | None = None,
 ) -> Render:
     """Alpha-composite Gaussians front to back into V images.
 
@@ -54,6 +58,8 @@ def rasterize(
     sh_degree: bases above it are left out (default: all that the scene has). features [N,F]: any further channels.
     antialiased: opacity is scaled by sqrt(det(cov) / det(cov + 0.3 I)), as in Mip-Splatting's 2D filter.
     backend: reference | cpu | gsplat, or auto (gsplat for splats on a GPU, cpu otherwise; float64 takes reference).
+    frozen: F further splats that stand before those of `scene` and take no derivative; `features` is then [F+N,F'], and
+    `means2d` and `radii` are those of `scene` alone. What the backend keeps of them makes the next call faster.
     Differentiable in every parameter of `scene`, in `background` and in `features`; not in `cameras`.
     Source: Kerbl et al. 2023, sections 4-6. Raises SceneError where arguments disagree in size, dtype or device.
     """
@@ -61,20 +67,54 @@ def rasterize(
         background = scene.means.new_zeros(3)
     if background.shape != (3,):
         raise SceneError(f"rasterize: background has shape {tuple(background.shape)}, expected (3,)")
-    if features is not None and (features.ndim != 2 or len(features) != len(scene)):
-        raise SceneError(f"rasterize: features have shape {tuple(features.shape)}, expected ({len(scene)}, F)")
+    rows = len(scene)
+    if frozen is not None:
+        _check(scene, frozen.scene)
+        rows += len(frozen)
+    if features is not None and (features.ndim != 2 or len(features) != rows):
+        raise SceneError(f"rasterize: features have shape {tuple(features.shape)}, expected ({rows}, F)")
     if sh_degree is not None and not 0 <= sh_degree <= scene.sh_degree:
         raise SceneError(f"rasterize: sh_degree {sh_degree} asked of splats that have degree {scene.sh_degree}")
     if backend == "auto":
         on_cpu = scene.means.device.type == "cpu"
         backend = ("reference" if scene.means.dtype == torch.float64 else "cpu") if on_cpu else "gsplat"
+    draw = BACKENDS.get(backend, "renderer.backend")
     cameras = cameras.to(scene.means.device, scene.means.dtype)
-    return BACKENDS.get(backend, "renderer.backend")(
-        scene,
-        cameras,
+    options = dict(
         background=background.to(scene.means),
         sh_degree=scene.sh_degree if sh_degree is None else sh_degree,
         features=features,
         depth=depth,
         antialiased=antialiased,
     )
+    if frozen is None:
+        return draw(scene, cameras, **options)
+    if backend in KEEPS and features is None and not depth:
+        return draw(scene, cameras, **options, frozen=frozen)
+    render = draw(Gaussians.cat([replace(part, extra={}) for part in (frozen.scene, scene)]), cameras, **options)
+    return replace(render, means2d=_tail(render.means2d, len(frozen)), radii=render.radii[:, len(frozen) :])
+
+
+def _check(scene: Gaussians, frozen: Gaussians) -> None:
+    """Raise SceneError where the two cannot be drawn as one."""
+    kinds = [(f"SH degree {s.sh_degree}", f"{s.means.dtype} on {s.means.device}") for s in (scene, frozen)]
+    for got, want in zip(*kinds, strict=True):
+        if got != want:
+            raise SceneError(
+                f"rasterize: frozen splats have {want}, the edited ones {got}, expected the same. "
+                "Take both from one scene, or convert the frozen ones with .to(device, dtype)."
+            )
+
+
+def _tail(means2d: Tensor, first: int) -> Tensor:
+    """The means2d of the splats from `first` on. A slice would lie beside the way from the loss to the parameters and
+    see no gradient; this leaf is handed the part of it that arrives at the whole."""
+    tail = means2d[:, first:].detach().requires_grad_(means2d.requires_grad)
+
+    def receive(grad: Tensor) -> None:
+        arrived = grad[:, first:]
+        tail.grad = arrived.clone() if tail.grad is None else tail.grad + arrived
+
+    if means2d.requires_grad:
+        means2d.register_hook(receive)
+    return tail

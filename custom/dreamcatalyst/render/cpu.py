@@ -6,6 +6,8 @@ float32 only. Every sum has a fixed order, so that the same bits come out whatev
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,8 +16,9 @@ from torch.autograd.function import once_differentiable
 from ..data.camera import Cameras
 from ..errors import SceneError
 from ..scene.gaussians import Gaussians
-from . import cpu_composite, cpu_project, cpu_sh, cpu_tiles
+from . import cpu_composite, cpu_frozen, cpu_project, cpu_sh, cpu_tiles
 from .api import Render
+from .frozen import Frozen
 
 
 def rasterize(
@@ -27,22 +30,27 @@ def rasterize(
     features: Tensor | None,
     depth: bool,
     antialiased: bool,
+    frozen: Frozen | None = None,
 ) -> Render:
-    """Draw `scene`; arguments and result as in `api.rasterize`. Raises SceneError for other than float32 on the CPU."""
+    """Draw `scene`; arguments and result as in `api.rasterize`, but `frozen` excludes features and depth. Raises
+    SceneError for other than float32 on the CPU."""
     if scene.means.dtype != torch.float32 or scene.means.device.type != "cpu":
         raise SceneError(
             f"rasterize: backend 'cpu' got {scene.means.dtype} splats on {scene.means.device}, expected torch.float32 "
             "on cpu. Convert them with .to('cpu', torch.float32), or choose backend 'reference', which takes any."
         )
-    parameters = scene.means, scene.quats, scene.log_scales, scene.logit_opacities
-    means2d, conics, depths, opacities, radii = Project.apply(*parameters, cameras, antialiased)
-    colors = Shade.apply(scene.means, scene.sh0, scene.shN, cameras.centers, sh_degree)
+    means2d, conics, colors, opacities, depths, radii = _splats(scene, cameras, sh_degree, antialiased)
     extras = [] if features is None else [features.to(colors).expand(len(cameras), -1, -1)]
     extras += [depths[..., None]] if depth else []
     extras = torch.cat(extras, dim=-1) if extras else None
+
+    def view(v: int, touched: np.ndarray) -> cpu_frozen.View:
+        return _frozen_view(frozen, cameras[v], touched, sh_degree, antialiased)
+
+    behind = None if frozen is None else view
     size = cameras.width, cameras.height
     rgb, alpha, image = Composite.apply(
-        means2d, conics, colors, opacities, extras, background, depths.detach(), radii, *size
+        means2d, conics, colors, opacities, extras, background, depths.detach(), radii, *size, behind
     )
     return Render(
         rgb=rgb,
@@ -52,6 +60,31 @@ def rasterize(
         means2d=means2d,
         radii=radii,
     )
+
+
+def _splats(scene: Gaussians, cameras: Cameras, sh_degree: int, antialiased: bool) -> tuple[Tensor, ...]:
+    """means2d [V,N,2], conics [V,N,3], colors [V,N,3], opacities [V,N], depths [V,N], radii [V,N]."""
+    parameters = scene.means, scene.quats, scene.log_scales, scene.logit_opacities
+    means2d, conics, depths, opacities, radii = Project.apply(*parameters, cameras, antialiased)
+    colors = Shade.apply(scene.means, scene.sh0, scene.shN, cameras.centers, sh_degree)
+    return means2d, conics, colors, opacities, depths, radii
+
+
+def _frozen_view(
+    frozen: Frozen, camera: Cameras, touched: np.ndarray, sh_degree: int, antialiased: bool
+) -> cpu_frozen.View:
+    """What is kept of the frozen splats in one view, made anew where there is nothing or `touched`, the numbers of the
+    tiles that edited splats touch, goes beyond it."""
+    size = camera.width, camera.height
+    numbers = (tensor.numpy().tobytes() for tensor in (camera.viewmats, camera.Ks))
+    key = "cpu", *numbers, *size, sh_degree, antialiased
+    kept = frozen.get(key)
+    if kept is None or not kept.covered[touched].all():
+        *splats, radii = _splats(frozen.scene, camera, sh_degree, antialiased)
+        arrays = [array[0] for array in _arrays(*splats)]
+        kept = cpu_frozen.view(*arrays, radii[0].numpy(), *size, touched, kept)
+        frozen.put(key, kept)
+    return kept
 
 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
@@ -107,10 +140,13 @@ class Shade(torch.autograd.Function):
 class Composite(torch.autograd.Function):
     """means2d [V,N,2], conics [V,N,3], colors [V,N,3], opacities [V,N], extras [V,N,E] or None, background [3] ->
     rgb [V,H,W,3], alpha [V,H,W,1], the extra channels [V,H,W,E] over zero. Splats are drawn in the order of depths
-    [V,N] where radii [V,N] are not 0."""
+    [V,N] where radii [V,N] are not 0; where `behind` is given, together with the splats of behind(v, touched tiles)."""
 
     @staticmethod
-    def forward(ctx, means2d, conics, colors, opacities, extras, background, depths, radii, width: int, height: int):
+    def forward(
+        ctx, means2d, conics, colors, opacities, extras, background, depths, radii, width: int, height: int,
+        behind: Callable[[int, np.ndarray], cpu_frozen.View] | None,
+    ):  # fmt: skip
         views, n = depths.shape
         channels = 0 if extras is None else extras.shape[-1]
         rgb, alpha = np.empty((views, height, width, 3), np.float32), np.empty((views, height, width, 1), np.float32)
@@ -120,31 +156,44 @@ class Composite(torch.autograd.Function):
         for v in range(views):
             xy, conic, color, opacity, z = _arrays(means2d[v], conics[v], colors[v], opacities[v], depths[v])
             order = cpu_tiles.depth_order(z, radii[v].numpy())
-            lists = cpu_tiles.tile_lists(order, xy, conic, opacity, color, width, height)
-            packed, starts, entries, first_slots = lists
+            packed, starts, entries, first_slots = cpu_tiles.tile_lists(
+                order, xy, conic, opacity, color, width, height
+            )
             extra = np.empty((len(order), 0), np.float32) if extras is None else _arrays(extras[v])[0][order]
-            final = np.empty((len(starts) - 1, cpu_composite.PIXELS), np.float32)
-            last = np.empty_like(final)
-            drawn = packed, extra, starts, entries, width, height, shade_behind
-            cpu_composite.forward(*drawn, rgb[v], alpha[v], image[v], final, last)
-            ctx.lists.append((order, first_slots, (*drawn, final, last)))
+            spans, rested = cpu_composite.spans(starts), 0
+            if behind is not None:
+                view = behind(v, np.flatnonzero(np.diff(starts)))
+                cpu_frozen.paint(view.image, shade_behind, rgb[v], alpha[v])
+                packed, spans, entries = cpu_frozen.merge(view, packed, z[order], starts, entries)
+                rested = len(spans)
+            final = np.empty((len(spans), cpu_composite.PIXELS), np.float32)
+            last, rest = np.empty_like(final), np.empty((rested, 4, cpu_composite.PIXELS), np.float32)
+            drawn = packed, extra, spans, entries, width, height, shade_behind
+            cpu_composite.forward(*drawn, rgb[v], alpha[v], image[v], final, last, rest)
+            ctx.lists.append((order, first_slots, (*drawn, final, last, rest)))
         ctx.shapes = n, channels
-        return torch.from_numpy(rgb), torch.from_numpy(alpha), torch.from_numpy(image)
+        alpha = torch.from_numpy(alpha)
+        ctx.save_for_backward(alpha)
+        return torch.from_numpy(rgb), alpha, torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, g_rgb: Tensor, g_alpha: Tensor, g_image: Tensor):
-        (n, channels), views = ctx.shapes, len(ctx.lists)
+        (n, channels), views, (alpha,) = ctx.shapes, len(ctx.lists), ctx.saved_tensors
         sizes = (views, n, 2), (views, n, 3), (views, n, 3), (views, n), (views, n, channels)
         g_means2d, g_conics, g_colors, g_opacities, g_extras = grads = [np.zeros(s, np.float32) for s in sizes]
-        g_background = np.zeros(3, np.float32)
+        g_background = np.zeros(3, np.float32) if ctx.needs_input_grad[5] else None
         for v, (order, first_slots, drawn) in enumerate(ctx.lists):
             slots = np.empty((int(first_slots[-1]), 9 + channels), np.float32)
             used = np.zeros(len(slots), np.uint8)
-            g_tiles = np.empty((len(drawn[-1]), 3), np.float32)
-            cpu_composite.backward(*drawn, *_arrays(g_rgb[v], g_alpha[v], g_image[v]), slots, used, g_tiles)
+            cotangents = _arrays(g_rgb[v], g_alpha[v], g_image[v])
+            cpu_composite.backward(*drawn, *cotangents, slots, used)
             targets = g_means2d[v], g_conics[v], g_opacities[v], g_colors[v], g_extras[v]
             cpu_composite.gather(order, first_slots, slots, used, *targets)
-            g_background += g_tiles.sum(axis=0)
+            if g_background is not None:
+                rows = np.empty((alpha.shape[1], 3), np.float32)
+                cpu_composite.background_rows(alpha[v].numpy(), cotangents[0], rows)
+                g_background += rows.sum(axis=0)
         out = [torch.from_numpy(g) for g in grads]
-        return *out[:4], out[4] if channels else None, torch.from_numpy(g_background), None, None, None, None
+        g_background = None if g_background is None else torch.from_numpy(g_background)
+        return *out[:4], out[4] if channels else None, g_background, *[None] * 5

@@ -32,6 +32,9 @@ from .thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 f32, u64 = np.float32, np.uint64
 PIXELS = TILE_W * TILE_H
 STRIDES = 64  # tasks: each takes every 64th tile, which evens out their work
+# Columns of a span, the work of one tile: its number; its entries begin:end; among them, first:after, outside of which
+# no splat takes derivatives. An entry is a packed splat and its slot, which is negative if it takes no derivatives.
+TILE, BEGIN, FIRST, AFTER, END = range(5)
 LOOK = 8  # splats between two looks at whether a tile is finished
 ZERO, ONE, CUT, CAP, STOP = f32(0), f32(1), f32(ALPHA_MIN), f32(ALPHA_MAX), f32(TRANSMITTANCE_MIN)
 
@@ -47,6 +50,11 @@ ROWS = 10
 SIGMA_MAX, EIGHTH = f32(6), f32(0.125)
 _nodes = 0.375 + 0.375 * np.cos(np.pi * (np.arange(64) + 0.5) / 64)
 P5, P4, P3, P2, P1, P0 = (f32(c) for c in np.polyfit(_nodes, np.exp(-_nodes), 5, w=np.exp(_nodes)))
+
+
+def spans(starts: np.ndarray) -> np.ndarray:
+    """Spans [S,5] of all tiles from the places [S+1] where their lists start, where all splats take derivatives."""
+    return np.stack([np.arange(len(starts) - 1), starts[:-1], starts[:-1], starts[1:], starts[1:]], axis=1)
 
 
 @njit(fastmath=True, error_model="numpy")
@@ -79,16 +87,27 @@ def _place(tile, tiles_x, scratch):
 
 
 @njit(fastmath=True, error_model="numpy")
+def _shape(packed, j):
+    """What `_alpha` needs of packed splat j, read once, before the loop over its pixels."""
+    return packed[j, PX], packed[j, PY], packed[j, A], packed[j, M], packed[j, D], packed[j, OPACITY]
+
+
+@njit(fastmath=True, error_model="numpy")
+def _alpha(s, p, shape):
+    """Offsets of a pixel from a splat's mean, u along its conic and dy, and the splat's alpha there."""
+    px, py, a, m, d, opacity = shape
+    dy = s[Y + p] - py
+    u = s[X + p] - px - m * dy
+    alpha = min(CAP, opacity * _exp_minus(min(a * u * u + d * dy * dy, SIGMA_MAX)))
+    return u, dy, alpha if alpha >= CUT else ZERO
+
+
+@njit(fastmath=True, error_model="numpy")
 def _draw(s, start, stop, packed, j, number):
     """Blend one packed splat into the pixels start:stop of the scratch array `s`."""
-    px, py, opacity = packed[j, PX], packed[j, PY], packed[j, OPACITY]
-    a, m, d = packed[j, A], packed[j, M], packed[j, D]
-    red, green, blue = packed[j, RED], packed[j, GREEN], packed[j, BLUE]
+    shape, red, green, blue = _shape(packed, j), packed[j, RED], packed[j, GREEN], packed[j, BLUE]
     for p in range(start, stop):
-        dy = s[Y + p] - py
-        u = s[X + p] - px - m * dy
-        alpha = min(CAP, opacity * _exp_minus(min(a * u * u + d * dy * dy, SIGMA_MAX)))
-        alpha = alpha if alpha >= CUT else ZERO
+        _, _, alpha = _alpha(s, p, shape)
         t = s[T + p]
         w = t * alpha
         goes_on = t - w > STOP  # false too where the pixel is finished and t negative
@@ -105,18 +124,26 @@ def _draw(s, start, stop, packed, j, number):
 
 
 @njit(fastmath=True, error_model="numpy")
+def _pass(s, start, stop, packed, j, number):
+    """Take one packed splat that takes no derivatives off the pixels start:stop again, the last drawn first."""
+    shape, red, green, blue = _shape(packed, j), packed[j, RED], packed[j, GREEN], packed[j, BLUE]
+    for p in range(start, stop):
+        _, _, alpha = _alpha(s, p, shape)
+        alpha = alpha if number <= s[LAST + p] else ZERO
+        t = s[T + p] / (ONE - alpha)
+        s[T + p] = t
+        s[BEHIND + p] += alpha * t * (red * s[V0 + p] + green * s[V1 + p] + blue * s[V2 + p])
+
+
+@njit(fastmath=True, error_model="numpy")
 def _undraw(s, start, stop, packed, j, number, slots, slot):
     """Take one packed splat off the pixels start:stop again, the last drawn first, and write to slots[slot] the
     derivatives in its mean (2), conic (3), opacity and colour (3)."""
-    px, py, opacity = packed[j, PX], packed[j, PY], packed[j, OPACITY]
-    a, m, d = packed[j, A], packed[j, M], packed[j, D]
+    shape = _, _, a, m, d, opacity = _shape(packed, j)
     red, green, blue = packed[j, RED], packed[j, GREEN], packed[j, BLUE]
     g_red, g_green, g_blue, g, gu, guu, gy, guy, gyy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
     for p in range(start, stop):
-        dy = s[Y + p] - py
-        u = s[X + p] - px - m * dy
-        alpha = min(CAP, opacity * _exp_minus(min(a * u * u + d * dy * dy, SIGMA_MAX)))
-        alpha = alpha if alpha >= CUT else ZERO
+        u, dy, alpha = _alpha(s, p, shape)
         alpha = alpha if number <= s[LAST + p] else ZERO
         v0, v1, v2, behind = s[V0 + p], s[V1 + p], s[V2 + p], s[BEHIND + p]
         inverse = ONE / (ONE - alpha)
@@ -147,39 +174,64 @@ def _undraw(s, start, stop, packed, j, number, slots, slot):
     slots[slot, 6], slots[slot, 7], slots[slot, 8] = g_red, g_green, g_blue
 
 
+@njit(fastmath=True, error_model="numpy")
+def _walk(s, more, packed, extras, entries, begin, here, there, y0):
+    """Blend the entries here:there of a tile whose list begins at `begin`. Returns where all of its pixels were
+    finished, which none of the later entries can change, else `there`."""
+    for k in range(here, there):
+        if (k - begin) % LOOK == 0:
+            brightest = -ONE
+            for p in range(u64(0), u64(PIXELS)):
+                brightest = max(brightest, s[T + p])
+            if brightest < ZERO:
+                return k
+        j = entries[k, 0]
+        start, stop = _rows(packed, j, y0)
+        _draw(s, start, stop, packed, j, f32(k - begin + 1))
+        for c in range(extras.shape[1]):
+            value = extras[j, c]
+            for p in range(start, stop):
+                more[c, p] += s[W + p] * value
+    return there
+
+
 @kernel(parallel=True, fastmath=True)
-def forward(packed, extras, starts, entries, width, height, background, rgb, alpha, image, final, last):
-    """Fill rgb [H,W,3], alpha [H,W,1], image [H,W,E] of the extra channels extras [M,E], and, for the backward pass,
-    the transmittance `final` and the number of the last splat `last`, both [tiles, PIXELS]."""
+def forward(packed, extras, spans, entries, width, height, background, rgb, alpha, image, final, last, rest):
+    """Fill the tiles of spans [S,5] in rgb [H,W,3], alpha [H,W,1] and image [H,W,E] of the extra channels extras [M,E],
+    and move each END to where the tile was finished.
+
+    For the backward pass: the transmittance `final` behind the entries before AFTER and the number of the last splat
+    `last` among them, both [S,PIXELS]; where there are entries from AFTER on, their colour and that of the background
+    and the transmittance behind everything, rest [S,4,PIXELS] (else not touched, and S may be 0)."""
     tiles_x, channels = -(-width // TILE_W), extras.shape[1]
-    tiles = tiles_x * -(-height // TILE_H)
     for task in prange(STRIDES):
         s, more = np.empty(ROWS * PIXELS, np.float32), np.empty((channels, PIXELS), np.float32)
-        for tile in range(task, tiles, STRIDES):
-            x0, y0 = _place(tile, tiles_x, s)
+        for i in range(task, spans.shape[0], STRIDES):
+            x0, y0 = _place(spans[i, TILE], tiles_x, s)
             s[T:] = ZERO
             more[:] = ZERO
             for y in range(TILE_H):
                 for x in range(TILE_W):  # pixels outside of the image count as finished
                     s[T + u64(y * TILE_W + x)] = ONE if x0 + x < width and y0 + y < height else -ONE
-            begin = starts[tile]
-            for k in range(begin, starts[tile + 1]):
-                if (k - begin) % LOOK == 0:
-                    brightest = -ONE
-                    for p in range(u64(0), u64(PIXELS)):
-                        brightest = max(brightest, s[T + p])
-                    if brightest < ZERO:
-                        break
-                j = entries[k, 0]
-                start, stop = _rows(packed, j, y0)
-                _draw(s, start, stop, packed, j, f32(k - begin + 1))
-                for c in range(channels):
-                    value = extras[j, c]
-                    for p in range(start, stop):
-                        more[c, p] += s[W + p] * value
+            begin, after, end = spans[i, BEGIN], spans[i, AFTER], spans[i, END]
+            spans[i, END] = _walk(s, more, packed, extras, entries, begin, begin, after, y0)
             for p in range(PIXELS):
                 q = u64(p)
-                final[tile, p], last[tile, p] = abs(s[T + q]), s[LAST + q]
+                final[i, p], last[i, p] = abs(s[T + q]), s[LAST + q]
+            if spans[i, END] == after and after < end:
+                for p in range(PIXELS):
+                    q = u64(p)
+                    rest[i, 0, p], rest[i, 1, p], rest[i, 2, p] = s[C0 + q], s[C1 + q], s[C2 + q]
+                spans[i, END] = _walk(s, more, packed, extras, entries, begin, after, end, y0)
+                for p in range(PIXELS):
+                    q = u64(p)
+                    t = abs(s[T + q])
+                    rest[i, 0, p] = s[C0 + q] - rest[i, 0, p] + t * background[0]
+                    rest[i, 1, p] = s[C1 + q] - rest[i, 1, p] + t * background[1]
+                    rest[i, 2, p] = s[C2 + q] - rest[i, 2, p] + t * background[2]
+                    rest[i, 3, p] = t
+            for p in range(PIXELS):
+                q = u64(p)
                 y, x = y0 + p // TILE_W, x0 + p % TILE_W
                 if x < width and y < height:
                     t = abs(s[T + q])
@@ -195,49 +247,53 @@ def forward(packed, extras, starts, entries, width, height, background, rgb, alp
 def backward(
     packed,
     extras,
-    starts,
+    spans,
     entries,
     width,
     height,
     background,
     final,
     last,
+    rest,
     v_rgb,
     v_alpha,
     v_image,
     slots,
     used,
-    g_tiles,
 ):
-    """Fill slots [I,9+E] with the derivatives of each pair of splat and tile, used [I] with 1 where there are any, and
-    g_tiles [tiles,3] with those in the background. v_*: the derivatives in the images of `forward`."""
+    """Fill slots [I,9+E] with the derivatives of each pair of splat and tile, and used [I] with 1 where there are any.
+    v_*: the derivatives in the images of `forward`."""
     tiles_x, channels = -(-width // TILE_W), extras.shape[1]
-    tiles = tiles_x * -(-height // TILE_H)
     for task in prange(STRIDES):
         s, more = np.zeros(ROWS * PIXELS, np.float32), np.zeros((channels, PIXELS), np.float32)
-        for tile in range(task, tiles, STRIDES):
-            x0, y0 = _place(tile, tiles_x, s)
+        for i in range(task, spans.shape[0], STRIDES):
+            x0, y0 = _place(spans[i, TILE], tiles_x, s)
             s[T:] = ZERO
             more[:] = ZERO
-            deepest, g0, g1, g2 = ZERO, ZERO, ZERO, ZERO
+            deepest, rested = ZERO, spans[i, AFTER] < spans[i, END]
             for p in range(PIXELS):
                 q = u64(p)
                 y, x = y0 + p // TILE_W, x0 + p % TILE_W
                 if x < width and y < height:
-                    t, v0, v1, v2 = final[tile, p], v_rgb[y, x, 0], v_rgb[y, x, 1], v_rgb[y, x, 2]
-                    s[T + q], s[LAST + q] = t, last[tile, p]
+                    t, v0, v1, v2 = final[i, p], v_rgb[y, x, 0], v_rgb[y, x, 1], v_rgb[y, x, 2]
+                    s[T + q], s[LAST + q] = t, last[i, p]
                     s[V0 + q], s[V1 + q], s[V2 + q] = v0, v1, v2
-                    through = background[0] * v0 + background[1] * v1 + background[2] * v2 - v_alpha[y, x, 0]
-                    s[BEHIND + q] = t * through
-                    g0, g1, g2 = g0 + t * v0, g1 + t * v1, g2 + t * v2
-                    deepest = max(deepest, last[tile, p])
+                    if rested:
+                        behind = rest[i, 0, p] * v0 + rest[i, 1, p] * v1 + rest[i, 2, p] * v2
+                        s[BEHIND + q] = behind - rest[i, 3, p] * v_alpha[y, x, 0]
+                    else:
+                        through = background[0] * v0 + background[1] * v1 + background[2] * v2 - v_alpha[y, x, 0]
+                        s[BEHIND + q] = t * through
+                    deepest = max(deepest, last[i, p])
                     for c in range(channels):
                         more[c, p] = v_image[y, x, c]
-            g_tiles[tile, 0], g_tiles[tile, 1], g_tiles[tile, 2] = g0, g1, g2
-            begin = starts[tile]
-            for k in range(begin + int(deepest) - 1, begin - 1, -1):
+            begin = spans[i, BEGIN]
+            for k in range(begin + int(deepest) - 1, spans[i, FIRST] - 1, -1):
                 j, slot = entries[k, 0], entries[k, 1]
                 start, stop = _rows(packed, j, y0)
+                if slot < 0:
+                    _pass(s, start, stop, packed, j, f32(k - begin + 1))
+                    continue
                 if channels > 0:
                     for p in range(start, stop):
                         s[VE + p] = ZERO
@@ -252,6 +308,17 @@ def backward(
                         total += s[W + p] * more[c, p]
                     slots[slot, 9 + c] = total
                 used[slot] = 1
+
+
+@kernel(parallel=True)
+def background_rows(alpha, v_rgb, rows):
+    """Fill rows [H,3], to be summed: the derivative in the background of alpha [H,W,1] and the image's."""
+    for y in prange(alpha.shape[0]):
+        r, g, b = ZERO, ZERO, ZERO
+        for x in range(alpha.shape[1]):
+            t = ONE - alpha[y, x, 0]
+            r, g, b = r + t * v_rgb[y, x, 0], g + t * v_rgb[y, x, 1], b + t * v_rgb[y, x, 2]
+        rows[y, 0], rows[y, 1], rows[y, 2] = r, g, b
 
 
 @kernel(parallel=True)
