@@ -7,6 +7,7 @@ import torch
 from dreamcatalyst.errors import SceneError
 from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
+from dreamcatalyst.scene.generations import Generations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -167,3 +168,100 @@ def test_what_does_not_fit_is_refused():
         splats.rearrange(torch.arange(3), torch.tensor([0]), {"means": torch.zeros(2, 3)})
     with pytest.raises(SceneError, match="no splats in it .*weights"):
         Splats.from_state_dict({"weights": 1}, torch.device("cpu"))
+
+
+# --- frozen splats and feathered borders
+
+
+def test_frozen_splats_come_first_and_cost_nothing_that_can_be_trained():
+    scene = numbered(5).scene.detach()
+    splats = Splats(scene, {"row": torch.tensor([1, 4])}, torch.tensor([False, True, False, False, True]))
+    assert (len(splats), splats.total) == (2, 5)
+    order = [0.0, 2.0, 3.0, 1.0, 4.0]
+    assert splats.scene.means[:, 0].tolist() == order and splats.scene.extra["label"][:, 0].tolist() == order
+    assert splats.edited.means.data_ptr() == splats.parameters["means"].data_ptr()
+    splats.scene.means.sum().backward()
+    assert torch.equal(splats.parameters["means"].grad, torch.ones(2, 3))
+    for name, value in [*splats.frozen.parameters(), *splats.frozen.extra.items()]:
+        assert not value.requires_grad and value.is_contiguous()
+        assert value.data_ptr() != (getattr(scene, name) if name in PARAMETERS else scene.extra[name]).data_ptr()
+
+
+def test_a_mask_of_everything_is_no_mask():
+    splats = Splats(numbered(3).scene, editable=torch.ones(3, dtype=torch.bool))
+    assert splats.frozen is None and splats.scene.means.data_ptr() == splats.parameters["means"].data_ptr()
+
+
+def held_bytes(splats: Splats) -> int:
+    """Gradients, moments and state of splats after a step."""
+    tensors = [*splats.state.values(), *(value.grad for value in splats.parameters.values())]
+    for moments in splats.optimizer.state.values():
+        tensors += [moments["exp_avg"], moments["exp_avg_sq"]]
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+
+
+def test_a_mask_of_a_twentieth_keeps_a_twentieth():
+    """Gradients, moments and anchors; the floor that was set is a tenth."""
+    scene, held = numbered(2000, 3).scene.detach(), []
+    for editable in (None, torch.arange(2000) < 100):
+        splats, generations = Splats(scene, editable=editable), Generations(1, 0.1, 2, 10, anchor="source")
+        generations.begin(splats)
+        splats.make_optimizer(RATES)
+        sum(value.sum() for _, value in splats.scene.parameters()).backward()
+        splats.optimizer.step()
+        held.append(held_bytes(splats))
+    assert held[1] * 20 == held[0]
+
+
+def test_frozen_splats_are_in_the_checkpoint():
+    splats = Splats(numbered(4).scene, editable=torch.tensor([True, False, True, False]))
+    back = Splats.from_state_dict(splats.state_dict(), torch.device("cpu"))
+    assert (len(back), back.total) == (2, 4)
+    for name, value in [*splats.scene.parameters(), *splats.scene.extra.items()]:
+        assert torch.equal(value, getattr(back.scene, name) if name in PARAMETERS else back.scene.extra[name])
+
+
+def test_a_feathered_border_scales_the_update_of_every_parameter():
+    share = torch.tensor([1.0, 0.25, 0.5])
+    feathered, plain = numbered(3), numbered(3)
+    feathered.state["update"] = share
+    before = feathered.scene.detach().clone()
+    for splats in (feathered, plain):
+        for value in splats.parameters.values():
+            value.grad = torch.ones_like(value)
+        with splats.scaled_update():
+            splats.optimizer.step()
+    for name in PARAMETERS:
+        start, whole = getattr(before, name), plain.parameters[name].detach()
+        weight = share.reshape(-1, *[1] * (start.ndim - 1))
+        torch.testing.assert_close(feathered.parameters[name].detach() - start, weight * (whole - start))
+        assert torch.equal(feathered.parameters[name][0], whole[0])
+
+
+def test_the_gradient_scaled_instead_would_have_been_undone_by_adam():
+    """Why the update is scaled: Adam's first step is the same for a gradient of any size."""
+    splats = numbered(2)
+    splats.parameters["means"].grad = torch.tensor([1.0, 0.01])[:, None].expand(2, 3).clone()
+    splats.optimizer.step()
+    moved = splats.parameters["means"].detach()[:, 0] - torch.tensor([0.0, 1.0])
+    torch.testing.assert_close(moved, torch.tensor([-0.01, -0.01]))
+
+
+def test_children_inherit_the_share_of_the_update():
+    splats = numbered(3)
+    splats.state["update"] = torch.tensor([1.0, 0.25, 0.5])
+    splats.rearrange(torch.tensor([0]), torch.tensor([1, 2]), {})
+    assert splats.state["update"].tolist() == [1.0, 0.25, 0.5]
+
+
+def test_masks_and_states_that_do_not_fit_are_refused():
+    scene = numbered(3).scene
+    with pytest.raises(SceneError, match=r"editable is torch.bool \(2,\), expected torch.bool \(3,\)"):
+        Splats(scene, editable=torch.ones(2, dtype=torch.bool))
+    with pytest.raises(SceneError, match="editable is torch.float32"):
+        Splats(scene, editable=torch.ones(3))
+    with pytest.raises(SceneError, match=r"state 'row' has \(3,\), expected 1 rows"):
+        Splats(scene, {"row": torch.arange(3)}, torch.tensor([True, False, False]))
+    for share in (0.0, 1.5, float("nan")):
+        with pytest.raises(SceneError, match=r"state 'update' leaves \(0,1\]"):
+            Splats(scene, {"update": torch.tensor([1.0, share, 0.5])})

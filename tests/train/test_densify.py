@@ -7,12 +7,13 @@ import torch
 from dreamcatalyst.errors import SceneError
 from dreamcatalyst.render.api import Render
 from dreamcatalyst.scene.edit import Splats
-from dreamcatalyst.scene.gaussians import Gaussians
+from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
+from dreamcatalyst.scene.generations import Generations
 from dreamcatalyst.train.densify import DensifyConfig, densify, observe, reset_opacity, screen_statistics, select
 from dreamcatalyst.train.optim import LearningRates
 
 
-def make_splats(scales, opacities=None, state=None) -> Splats:
+def make_splats(scales, opacities=None, state=None, editable=None) -> Splats:
     n = len(scales)
     generator = torch.Generator().manual_seed(0)
     scene = Gaussians.from_colors(
@@ -21,7 +22,7 @@ def make_splats(scales, opacities=None, state=None) -> Splats:
         torch.rand(n, 3, generator=generator),
         torch.full((n,), 0.5) if opacities is None else torch.tensor(opacities),
     )
-    splats = Splats(scene, state)
+    splats = Splats(scene, state, None if editable is None else torch.tensor(editable))
     splats.state.update(screen_statistics(splats))
     splats.make_optimizer(LearningRates().at(0, 10, 1.0))
     return splats
@@ -150,3 +151,75 @@ def test_opacity_reset():
     reset_opacity(splats)
     torch.testing.assert_close(splats.scene.opacities.detach(), torch.tensor([0.01, float(before[1])]))
     assert splats.optimizer.state[splats.parameters["logit_opacities"]]["exp_avg"].abs().sum() == 0
+
+
+def test_frozen_splats_are_neither_densified_nor_pruned():
+    scales, opacities = [0.01, 1.0, 9.0, 0.01, 1.0, 9.0], [0.5, 0.5, 0.5, 0.001, 0.001, 0.5]
+    splats = make_splats(scales, opacities, {"row": torch.arange(3)}, [True, True, True, False, False, False])
+    frozen = splats.frozen.clone()
+    densify(with_gradient(splats, [1.0, 1.0, 0.0]), DensifyConfig(grad_threshold=0.5, max_size=2.0), 1.0, generator())
+    assert splats.state["row"].tolist() == [0, 0, 1, 1] and splats.total == 7
+    assert all(torch.equal(getattr(splats.frozen, name), getattr(frozen, name)) for name in PARAMETERS)
+    assert torch.equal(splats.scene.means[:3], frozen.means)
+
+
+def test_screen_gradients_of_frozen_splats_are_left_out():
+    """Whether the renderer hands over means2d of all splats, frozen ones first, or of the editable ones alone."""
+    gradient = torch.randn(2, 5, 2, generator=generator())
+    every, own = (make_splats([0.01] * 5, editable=[False, True, False, True, True]) for _ in range(2))
+    observe(every, render_with_gradient(gradient))
+    observe(own, render_with_gradient(gradient[:, 2:]))
+    assert len(own.state["grad_sum"]) == 3 and own.state["grad_sum"].min() > 0
+    for name in ("grad_sum", "grad_count", "max_radius"):
+        assert torch.equal(every.state[name], own.state[name])
+
+
+def test_the_cap_counts_frozen_splats():
+    splats = with_gradient(make_splats([0.01] * 10, editable=[True] * 4 + [False] * 6), [1.0] * 4)
+    densify(splats, DensifyConfig(grad_threshold=0.5, max_splats=12), 1.0, generator())
+    assert (len(splats), splats.total) == (6, 12)
+
+
+def test_an_object_may_vanish_where_other_splats_are_left():
+    splats = make_splats([0.1] * 3, [1e-4, 1e-4, 0.5], editable=[True, True, False])
+    report = densify(splats, CONFIG, 1.0, generator())
+    assert report.pruned == 2 and len(splats) == 0 and splats.total == 1
+    splats.scene.means.sum().backward()  # and the run goes on
+    splats.optimizer.step()
+    observe(splats, render_with_gradient(torch.randn(1, 1, 2)))
+    assert densify(splats, CONFIG, 1.0, generator()) == type(report)()
+    reset_opacity(splats)
+
+
+@pytest.mark.parametrize("anchor", ["last-densify", "source"])
+def test_children_are_a_generation_of_their_own_and_hold_to_where_they_were_born(anchor):
+    splats, generations = make_splats([0.01, 1.0, 0.01]), Generations(0.05, 0.1, 1.3, 10, anchor=anchor)
+    generations.begin(splats)
+    source = splats.scene.detach().clone()
+    with torch.no_grad():
+        splats.parameters["means"] += 0.5
+    densify(with_gradient(splats, [1.0, 1.0, 0.0]), CONFIG, 1.0, generator(), generations)
+    assert splats.state["generation"].tolist() == [0, 0, 1, 1, 1]  # two survivors, the clone, the two halves
+    assert generations.weights == pytest.approx([0.065, 0.0])
+    for name in PARAMETERS:
+        own, anchors = splats.parameters[name].detach(), splats.state[f"anchor_{name}"]
+        assert torch.equal(anchors[2:], own[2:])
+        expected = own[:2] if anchor == "last-densify" else getattr(source, name)[[0, 2]]
+        assert torch.equal(anchors[:2], expected)
+
+
+def test_weights_and_anchors_move_on_where_nothing_was_added():
+    splats, generations = make_splats([0.01]), Generations(0.05, 0.1, 1.3, 10)
+    generations.begin(splats)
+    with torch.no_grad():
+        splats.parameters["means"] += 0.5
+    densify(splats, CONFIG, 1.0, generator(), generations)
+    assert len(generations) == 2 and torch.equal(splats.state["anchor_means"], splats.parameters["means"])
+
+
+def test_a_refused_densification_leaves_generations_as_they_were():
+    splats, generations = make_splats([0.1], [1e-4]), Generations(0.05, 0.1, 1.3, 10)
+    generations.begin(splats)
+    with pytest.raises(SceneError, match="every splat"):
+        densify(splats, CONFIG, 1.0, generator(), generations)
+    assert generations.weights == [0.05]
