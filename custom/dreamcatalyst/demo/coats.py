@@ -12,6 +12,7 @@ from ..scene.gaussians import SH_C0, Gaussians
 from .shapes import facing, frames, speckle
 from .worlds import Solid, Thing, World
 
+FUR_SHADE = 0.8  # fur scatters light: softer shade than a stone's
 Coat = Callable[[Thing, Solid, Tensor], Tensor]  # thing, its solid, points [n,3] in the world -> albedo [n,3]
 
 
@@ -44,8 +45,10 @@ def panda(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
     """White; black are ears, the patches around the eyes, nose, limbs and the band over the shoulders."""
     white, black = points.new_tensor([0.93, 0.92, 0.88]), points.new_tensor([0.07, 0.07, 0.08])
     dark = points.new_zeros(len(points), 1)
-    if solid.name in ("ear", "eye", "nose", "arm", "leg"):
+    if solid.name in ("ear", "nose", "arm", "leg"):
         dark = dark + 1
+    elif solid.name == "eye":  # brown, so that it is seen in its patch
+        return points.new_tensor([0.24, 0.18, 0.15]).expand(len(points), 3)
     elif solid.name in ("body", "belly"):
         height = _body(thing).local(points)[:, 2]
         dark = soft((height - 0.58).abs(), 0.22, 0.025)
@@ -91,7 +94,7 @@ def grizzly(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
     }
     base = points.new_tensor(color.get(solid.name, (0.46, 0.28, 0.14))).expand(len(points), 3)
     if solid.name in ("arm", "leg"):
-        paw = soft(solid.local(points)[:, 2 if solid.name == "arm" else 2], -0.1, 0.3)
+        paw = soft(solid.local(points)[:, 2], -0.1, 0.3)
         base = base * (1 - paw) + points.new_tensor([0.25, 0.14, 0.07]) * paw
     elif solid.name == "body":
         hump = 1 - soft(solid.local(points)[:, 2], 0.55, 0.12)
@@ -113,7 +116,6 @@ GRIZZLY_SHAPE = {
     "body": (1.06, 1.06, 1.04),
     "arm": (1.08, 1.1, 1.0),
 }
-SNOUT = {"panda": -0.015, "polar": 0.03, "grizzly": 0.015}
 
 
 def reshaped(solid: Solid, shape: dict[str, tuple[float, ...]]) -> Solid:
@@ -136,7 +138,7 @@ def dress(world: World, coat: Coat, shape: dict[str, tuple[float, ...]], thing: 
         normals = torch.nn.functional.normalize(unit / solid.radii, dim=-1) @ solid.rotation.T
         points = (unit * solid.radii) @ solid.rotation.T + solid.center
         fur = 1 + speckle(points, world.seed + 7, 0.07, 0.06)
-        colors = coat(new, solid, points) * world.light.lit(normals) * fur[:, None]
+        colors = coat(new, solid, points) * world.light.lit(normals) ** FUR_SHADE * fur[:, None]
         fields = dict(colors=colors)
         if solid.name in shape or not torch.equal(old.center, solid.center):
             grown = float((solid.radii / old.radii).log().mean())
@@ -154,28 +156,33 @@ def ramp(x: Tensor, stops: tuple[tuple[float, float, float], ...]) -> Tensor:
     return table[i] * (1 - part) + table[i + 1] * part
 
 
-BRONZE = ((0.10, 0.06, 0.04), (0.30, 0.17, 0.09), (0.56, 0.34, 0.17), (0.80, 0.56, 0.32), (1.0, 0.88, 0.66))
-GOLD = ((0.20, 0.10, 0.02), (0.55, 0.34, 0.04), (0.86, 0.62, 0.10), (1.0, 0.83, 0.30), (1.0, 0.96, 0.72))
+BRONZE = ((0.05, 0.05, 0.04), (0.20, 0.15, 0.09), (0.42, 0.29, 0.15), (0.66, 0.48, 0.26), (0.98, 0.88, 0.66))
+GOLD = ((0.16, 0.08, 0.01), (0.50, 0.29, 0.02), (0.86, 0.60, 0.08), (1.0, 0.85, 0.32), (1.0, 0.98, 0.82))
+
+
+def _grain(rows: Gaussians, lit: Tensor) -> Tensor:
+    """Brightness [n] of splats without their light `lit` [n]: about 1 on the plain surface, less on eyes and joints."""
+    bare = colors_of(rows).mean(-1) / lit
+    return (bare / bare.median()).clamp(0.2, 1.3)
 
 
 def metal(world: World, thing: str, stops: tuple[tuple[float, float, float], ...]) -> Gaussians:
-    """The world with `thing` cast in metal: a steep ramp over its light, with the lamp's gleam; dark parts stay so."""
+    """The world with `thing` cast in metal: what faces up mirrors the sky, what faces down the dark ground, and the
+    lamp gleams; dark parts stay dark."""
     first, last = world.thing(thing).rows
-    rows = world.scene[slice(first, last)]
-    normals, brightness = facing(rows), colors_of(rows).mean(-1)
+    rows = world.scene[first:last]
+    normals = facing(rows)
     towards = torch.nn.functional.normalize(normals.new_tensor(world.light.direction), dim=0)
-    lit = world.light.shade(normals)
-    grain = brightness / (lit * (brightness / lit).median())  # 1 for the plain surface, less for eyes and joints
-    facing_lamp = (normals @ towards) * 0.5 + 0.5
-    x = 0.12 + 0.55 * facing_lamp**1.3 + 0.35 * facing_lamp**10
-    return with_rows(world.scene, first, colors=ramp(x * (0.35 + 0.65 * grain.clamp(0.2, 1.3)), stops))
+    lamp, above = (normals @ towards) * 0.5 + 0.5, torch.sigmoid((normals[:, 2] - 0.15) / 0.12)
+    bright = 0.08 + 0.30 * lamp**1.5 + 0.22 * above + 0.55 * lamp**16
+    tarnish = 0.3 + 0.7 * _grain(rows, world.light.shade(normals))
+    return with_rows(world.scene, first, colors=ramp(bright * tarnish, stops))
 
 
 def paint(world: World, thing: str, color: tuple[float, float, float]) -> Gaussians:
     """The world with `thing` painted: its own light and grain stay."""
     first, last = world.thing(thing).rows
-    rows = world.scene[slice(first, last)]
-    brightness, lit = colors_of(rows).mean(-1), world.light.shade(facing(rows))
-    grain = brightness / (lit * (brightness / lit).median())
-    white = world.light.lit(facing(rows)) * (0.4 + 0.6 * grain.clamp(0.2, 1.3))[:, None]
+    rows = world.scene[first:last]
+    normals = facing(rows)
+    white = world.light.lit(normals) * (0.4 + 0.6 * _grain(rows, world.light.shade(normals)))[:, None]
     return with_rows(world.scene, first, colors=white * white.new_tensor(color))

@@ -86,7 +86,7 @@ THINGS = ("bear statue", "ball", "box", "flower pot")
 
 def _animals() -> list[Edit]:
     bears = {
-        "panda": (panda, PANDA_SHAPE, ("Turn it into a panda bear", "Give the bear the fur of a panda"), 5.0),
+        "panda": (panda, PANDA_SHAPE, ("Turn it into a panda bear", "Give the bear the fur of a panda"), 7.0),
         "polar bear": (polar_bear, POLAR_SHAPE, ("Give the bear the fur of a polar bear",), 3.0),
         "grizzly bear": (grizzly, GRIZZLY_SHAPE, ("Turn the statue into a brown bear", "Turn it into a grizzly"), 3.0),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,17 @@ from ..data.camera import Cameras
 from ..errors import DataError
 from ..render.api import rasterize
 from ..scene.gaussians import Gaussians
-from .edits import Edit, apply_edit, possible
+from .edits import EDITS, NOTHING, Edit, apply_edit, possible
+from .photographs import crop, load_photographs
 from .random_world import HELD_OUT, random_world
 from .worlds import World
 
 SHARD = 250  # pairs in one file
-CAMERAS, EDITS_PER_WORLD = 3, 4  # each world gives their product in pairs
+CAMERAS, EDITS_PER_SOURCE = 3, 4  # a world gives their product in pairs, a photograph one for each edit
+PHOTOGRAPHED = 0.2  # how often a photograph is drawn in place of a world: about one pair in thirteen
 VISIBLE = 0.03  # a pixel belongs to the object where its splats make up more than this of it
-Pair = dict[str, object]
+
+Operators = Callable[[str], Callable[[Tensor], Tensor]]  # an edit's name -> RGB [B,3,H,W] in [0,1] to the same
 
 
 def worded(edit: Edit, rng: Generator) -> str:
@@ -37,87 +40,104 @@ def worded(edit: Edit, rng: Generator) -> str:
     return text + "." if text and rng.random() < 0.1 else text
 
 
-def draw_edits(world: World, rng: Generator) -> list[Edit]:
-    """EDITS_PER_WORLD different edits that make sense in `world`, drawn by their weights."""
-    known = possible(world)
+def drawn(known: list[Edit], rng: Generator) -> list[Edit]:
+    """EDITS_PER_SOURCE different ones of the `known` edits, drawn by their weights."""
     weights = np.array([edit.weight for edit in known])
-    chosen = rng.choice(len(known), EDITS_PER_WORLD, replace=False, p=weights / weights.sum())
+    chosen = rng.choice(len(known), EDITS_PER_SOURCE, replace=False, p=weights / weights.sum())
     return [known[i] for i in chosen]
+
+
+def _pair(source: ndarray, edited: ndarray, mask: ndarray, edit: Edit, world: int, rng: Generator) -> dict:
+    return dict(source=source, edited=edited, mask=mask, instruction=worded(edit, rng), edit=edit.name, world=world)
 
 
 def _bytes(images: Tensor) -> ndarray:
     return (images.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
-def _drawn(scene: Gaussians, cameras: Cameras, rows: tuple[int, int] | None) -> tuple[ndarray, Tensor | None]:
+def _render(scene: Gaussians, cameras: Cameras, rows: tuple[int, int]) -> tuple[ndarray, Tensor]:
     """Images uint8 [V,H,W,3], and how much of each pixel [V,H,W] is made up of the splats in `rows`."""
-    features = None
-    if rows is not None:
-        features = scene.means.new_zeros(len(scene), 1)
-        features[rows[0] : rows[1]] = 1
+    share = scene.means.new_zeros(len(scene), 1)
+    share[rows[0] : rows[1]] = 1
     with torch.no_grad():
-        out = rasterize(scene, cameras, features=features)
-    return _bytes(out.rgb), None if rows is None else out.features[..., 0]
+        out = rasterize(scene, cameras, features=share)
+    return _bytes(out.rgb), out.features[..., 0]
 
 
-def world_pairs(seed: int, size: int) -> Iterator[Pair]:
-    """All pairs of the world of `seed`: each of its edits from each of its cameras."""
-    world, rng = random_world(seed, CAMERAS, size), np.random.default_rng([seed, 3])
-    source, _ = _drawn(world.scene, world.cameras, None)
-    for edit in draw_edits(world, rng):
-        rows = None if edit.target is None else world.thing(edit.target).rows
-        edited, after = _drawn(apply_edit(world, edit.name), world.cameras, rows)
+def world_pairs(world: World, rng: Generator) -> Iterator[dict]:
+    """Some edits of `world` from each of its cameras, as pairs."""
+    source, _ = _render(world.scene, world.cameras, (0, 0))
+    for edit in drawn(possible(world), rng):
+        rows = world.thing(edit.target).rows if edit.target else (0, len(world.scene))
+        edited, after = _render(apply_edit(world, edit.name), world.cameras, rows)
         mask = np.full(source.shape[:3], 255, np.uint8)
-        if rows is not None:
-            _, before = _drawn(world.scene, world.cameras, rows)
-            mask = ((torch.maximum(before, after) > VISIBLE) * 255).to(torch.uint8).numpy()
-        for i in range(CAMERAS):
-            yield dict(
-                source=source[i],
-                edited=edited[i],
-                mask=mask[i],
-                instruction=worded(edit, rng),
-                edit=edit.name,
-                world=np.int64(seed),
-            )
+        if edit.target:
+            before = _render(world.scene, world.cameras, rows)[1]
+            mask = _bytes((torch.maximum(before, after) > VISIBLE).float())
+        for i in range(len(world.cameras)):
+            yield _pair(source[i], edited[i], mask[i], edit, world.seed, rng)
+
+
+def photograph_pairs(images: list[ndarray], operators: Operators, size: int, rng: Generator) -> Iterator[dict]:
+    """Some global edits of a crop of one of `images`, as pairs; their world is -1."""
+    source = crop(images, size, rng)
+    tensor = torch.from_numpy(source).permute(2, 0, 1)[None].float() / 255
+    for edit in drawn([edit for edit in EDITS.values() if edit.scope == "global"], rng):
+        edited = source
+        if edit.name != NOTHING:
+            edited = _bytes(operators(edit.name)(tensor)[0].permute(1, 2, 0))
+        yield _pair(source, edited, np.full((size, size), 255, np.uint8), edit, -1, rng)
+
+
+def shard_pairs(seed: int, index: int, size: int, images: list[ndarray], operators: Operators | None) -> Iterator[dict]:
+    """The pairs of one shard, without end: the first n are the same whatever is taken."""
+    rng = np.random.default_rng([seed, index])
+    while True:
+        if images and rng.random() < PHOTOGRAPHED:
+            yield from photograph_pairs(images, operators, size, rng)
+        else:
+            yield from world_pairs(random_world(int(rng.integers(HELD_OUT, 2**31)), CAMERAS, size), rng)
 
 
 def _settings(folder: Path, settings: dict) -> None:
     """Keep what the shards are made of beside them. Raises DataError where other pairs are there already."""
     file = folder / "pairs.json"
-    if file.exists():
-        there = json.loads(file.read_text(encoding="utf-8"))
-        if there != settings:
-            raise DataError(
-                f"{file}: the folder holds pairs made with {there}, asked for {settings}. Choose another folder"
-            )
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(settings), encoding="utf-8")
+    if not file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(settings), encoding="utf-8")
+    elif (there := json.loads(file.read_text(encoding="utf-8"))) != settings:
+        raise DataError(f"{folder}: holds pairs made with {there}, asked for are {settings}. Choose another folder")
 
 
-def make_pairs(folder: Path, count: int, seed: int, size: int = 128) -> None:
+def _count(file: Path) -> int:
+    """How many pairs a shard holds, 0 where there is none."""
+    if not file.exists():
+        return 0
+    with np.load(file) as shard:
+        return len(shard["world"])
+
+
+def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs: Operators | None = None) -> None:
     """Write `count` training pairs of `size` x `size` pixels into `folder`, in shards pairs-00000.npz, ...
 
     Each shard has source, edited uint8 [n,H,W,3]; mask uint8 [n,H,W] (255 where the edited object is, everywhere for
-    global edits); instruction, edit [n] strings; world int64 [n] (seeds of HELD_OUT and above). Shard i depends on
-    `seed` and i alone; a shard appears whole or not at all, and those that are there are kept, so that an interrupted
-    call is continued by the same call, with the same bits in the end.
-    Raises DataError where the folder holds pairs of other settings.
+    global edits); instruction, edit [n] strings; world int64 [n]: the world's seed, HELD_OUT or above, -1 for a
+    photograph. Shard i depends on `seed` and i alone. It appears whole or not at all, and those that are there are
+    kept: an interrupted call is continued by the same call, and more pairs by a larger `count`, with the same bits.
+    photographs: also take the free photographs of `load_photographs`, edited by what this gives for an edit's name
+    (sunset, autumn, snow, night).
+    Raises DataError where the folder holds pairs of other settings, ConfigError where photographs are not installed.
     """
-    folder = Path(folder)
-    _settings(folder, dict(seed=seed, size=size, shard=SHARD))
+    folder, images = Path(folder), load_photographs() if photographs else []
+    _settings(folder, dict(seed=seed, size=size, shard=SHARD, photographs=len(images)))
     for i in range(-(-count // SHARD)):
         wanted, file = min(SHARD, count - i * SHARD), folder / f"pairs-{i:05d}.npz"
-        if file.exists() and len(np.load(file)["world"]) >= wanted:
+        if _count(file) >= wanted:
             continue
-        rng, pairs = np.random.default_rng([seed, i]), []
-        while len(pairs) < wanted:
-            pairs += world_pairs(int(rng.integers(HELD_OUT, 2**31)), size)
-        arrays = {key: np.stack([np.asarray(pair[key]) for pair in pairs[:wanted]]) for key in pairs[0]}
+        pairs = [pair for _, pair in zip(range(wanted), shard_pairs(seed, i, size, images, photographs), strict=False)]
         part = file.with_suffix(".part")
         with part.open("wb") as stream:
-            np.savez(stream, **arrays)
+            np.savez(stream, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
         part.replace(file)
 
 
@@ -127,5 +147,8 @@ def read_pairs(folder: Path) -> dict[str, ndarray]:
     files = sorted(Path(folder).glob("pairs-*.npz"))
     if not files:
         raise DataError(f"{folder}: no training pairs (pairs-*.npz) in it. Make some with make_pairs")
-    shards = [np.load(file) for file in files]
-    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0].files}
+    shards = []
+    for file in files:
+        with np.load(file) as shard:
+            shards.append(dict(shard))
+    return {key: np.concatenate([shard.pop(key) for shard in shards]) for key in list(shards[0])}

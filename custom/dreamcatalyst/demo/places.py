@@ -123,6 +123,7 @@ def floor(rng: Generator, light: Light, level: float, kinds: dict, square: bool,
         points, normals, widths = plane((0.0, 0.0, level), (ROOM, 0.0, 0.0), (0.0, ROOM, 0.0), 0.108)
     else:
         points, normals, widths = disc((0.0, 0.0, level), FLOOR_RADIUS, FLOOR_SPLATS)
+        widths = widths * rng.uniform(1.0, 1.35)  # sharp with a little sky shining through, or closed
     color = kind(points, rng) * light.lit(normals)
     strength = rng.uniform(0.0, 0.45)
     for x, y, radius in shadows.tolist():

@@ -47,7 +47,7 @@ def random_light(rng: Generator) -> Light:
     direction = (math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height))
     warm = rng.normal() * 0.035
     color = (1 + warm, 1.0, 1 - warm)
-    return Light(direction, rng.uniform(0.5, 0.8), rng.uniform(0.35, 0.5), color)
+    return Light(direction, rng.uniform(0.5, 0.8), rng.uniform(0.4, 0.55), color)
 
 
 def pedestal(rng: Generator) -> tuple[Solid, float]:
@@ -61,11 +61,8 @@ def pedestal(rng: Generator) -> tuple[Solid, float]:
 def bear(rng: Generator, light: Light, first: int) -> tuple[Gaussians, Thing]:
     """A bear statue in the middle, most often on a pedestal, turned any way."""
     base, level = pedestal(rng) if rng.random() < 0.7 else (None, LEVEL)
-    spin = turn("z", rng.uniform(0, 360))
-    parts = [
-        turned(p, torch.zeros(3), spin, rng.uniform(0.92, 1.06) if i < 0 else 1.0)
-        for i, p in enumerate(bear_solids(rng))
-    ]
+    spin, size = turn("z", rng.uniform(0, 360)), rng.uniform(0.92, 1.06)
+    parts = [turned(part, torch.zeros(3), spin, size) for part in bear_solids(rng)]
     lift = torch.tensor([*rng.uniform(-0.06, 0.06, 2), level], dtype=torch.float32)
     parts = [Solid(p.name, p.center + lift, p.radii, p.rotation) for p in parts]
     parts += [base] if base else []
@@ -134,8 +131,8 @@ def cameras_around(rng: Generator, n: int, size: int) -> Cameras:
     angle = torch.tensor(rng.uniform(0, 2 * math.pi, n))
     tilt = torch.tensor(np.clip(rng.normal(17, 10, n), 1, 40)).deg2rad()
     fov = rng.uniform(38, 52, n)
-    seen = rng.uniform(1.5, 2.2, n)  # height of what the picture shows at the target, world units
-    radius = torch.tensor(np.clip(seen / 2 / np.tan(np.radians(fov) / 2), 1.6, 3.0))
+    seen = rng.uniform(1.6, 2.2, n)  # height of what the picture shows at the target, world units
+    radius = torch.tensor(np.clip(seen / 2 / np.tan(np.radians(fov) / 2), 1.9, 3.0))
     target = torch.tensor([0.0, 0.0, 0.44]) + torch.tensor(rng.normal(size=(n, 3)) * 0.05)
     eye = target + radius[:, None] * torch.stack([tilt.cos() * angle.cos(), tilt.cos() * angle.sin(), tilt.sin()], -1)
     K = torch.zeros(n, 3, 3)
@@ -163,7 +160,7 @@ def random_world(seed: int = 0, views: int = 32, size: int = 128) -> World:
         sizes.append(rng.uniform(0.32, 0.5) if middle else rng.uniform(0.14, 0.26))
         if not middle:
             angle = start + 2.4 * k + rng.uniform(-0.5, 0.5)
-            spots[k] = rng.uniform(0.8, 1.05) * torch.tensor([math.cos(angle), math.sin(angle)])
+            spots[k] = rng.uniform(0.75, 0.95) * torch.tensor([math.cos(angle), math.sin(angle)])
     shadows = [[0.0, 0.0, 0.42]] * with_bear + [[*spots[k].tolist(), 1.1 * sizes[k]] for k in range(len(kinds))]
     made = [floor(rng, light, LEVEL, INDOORS if indoors else OUTDOORS, indoors, torch.tensor(shadows))]
     if indoors:

@@ -52,17 +52,17 @@ def sunset(world: World) -> Gaussians:
     colors, normals = colors_of(world.scene), facing(world.scene)
     sun = _ahead(world) * math.cos(0.2) + torch.tensor([0.0, 0.0, math.sin(0.2)])
     lit = ((normals @ sun) * 0.5 + 0.5)[:, None] ** 1.5
-    warm, shade = colors.new_tensor([1.15, 0.62, 0.32]), colors.new_tensor([0.52, 0.38, 0.46])
+    warm, shade = colors.new_tensor([0.80, 0.46, 0.20]), colors.new_tensor([0.42, 0.36, 0.41])
     ground = colors / world.light.shade(normals)[:, None] * (shade + warm * lit)
     sky, height, cloud = _heavens(world)
     unit = torch.nn.functional.normalize(world.scene.means, dim=-1)
     glow = ((unit @ sun) * 0.5 + 0.5)[:, None]
     gradient = _gradient(
         height,
-        (0.0, (0.98, 0.58, 0.24)),
-        (0.14, (0.93, 0.45, 0.30)),
-        (0.38, (0.66, 0.36, 0.46)),
-        (0.9, (0.34, 0.27, 0.50)),
+        (0.0, (0.99, 0.70, 0.36)),
+        (0.14, (0.95, 0.55, 0.34)),
+        (0.38, (0.72, 0.46, 0.48)),
+        (0.9, (0.38, 0.34, 0.56)),
     )
     above = gradient * (0.85 + 0.2 * glow) + colors.new_tensor([0.35, 0.25, 0.05]) * glow**12
     above = above + cloud * colors.new_tensor([0.10, 0.02, -0.03])
@@ -72,7 +72,7 @@ def sunset(world: World) -> Gaussians:
 def night(world: World) -> Gaussians:
     """Moonlight: dim and blue, with a dark sky that is a little lighter at the horizon."""
     colors = colors_of(world.scene)
-    dark = _saturated(colors, 0.4) * colors.new_tensor([0.24, 0.32, 0.50]) + colors.new_tensor([0.01, 0.015, 0.04])
+    dark = _saturated(colors, 0.4) * colors.new_tensor([0.34, 0.43, 0.64]) + colors.new_tensor([0.01, 0.02, 0.05])
     sky, height, cloud = _heavens(world)
     gradient = _gradient(height, (0.0, (0.13, 0.18, 0.33)), (0.3, (0.06, 0.09, 0.22)), (0.9, (0.02, 0.03, 0.11)))
     above = gradient + cloud * colors.new_tensor([0.03, 0.04, 0.06])
@@ -85,11 +85,11 @@ def autumn(world: World) -> Gaussians:
     red, green, blue = colors.unbind(-1)
     foliage = torch.sigmoid(((green - torch.maximum(red, blue)) / green.clamp(min=0.05) - 0.06) / 0.03)[:, None]
     tone = (0.5 + speckle(scene.means, world.seed + 11, 0.6, 0.5)).clamp(0, 1)
-    leaf = _gradient(tone, (0.0, (0.95, 0.32, 0.10)), (0.5, (1.0, 0.55, 0.13)), (1.0, (1.0, 0.75, 0.22)))
+    leaf = _gradient(tone, (0.0, (0.78, 0.30, 0.09)), (0.5, (0.88, 0.50, 0.14)), (1.0, (0.90, 0.70, 0.26)))
     brightness = colors.amax(-1, keepdim=True)
-    leaves = leaf * (0.12 + 1.35 * brightness)
+    leaves = leaf * (0.2 + 1.2 * brightness)
     litter = torch.sigmoid(speckle(scene.means, world.seed + 12, 9.0, 0.22) - 1.2)[:, None] * 0.6
-    litter = litter * part_mask(scene, "floor")[:, None] * (1 - part_mask(scene, "wall", "sky").float())[:, None]
+    litter = litter * part_mask(scene, "floor")[:, None]
     rest = colors * colors.new_tensor([1.05, 0.96, 0.84])
     rest = rest * (1 - litter) + litter * leaf * (0.2 + 0.9 * brightness)
     return _recolored(world, foliage * leaves + (1 - foliage) * rest)
