@@ -85,7 +85,7 @@ def make_grounding_dino(path: Path) -> Path:
         encoder_layers=1,
         encoder_ffn_dim=16,
         encoder_attention_heads=2,
-        decoder_layers=1,
+        decoder_layers=2,
         decoder_ffn_dim=16,
         decoder_attention_heads=2,
         max_text_len=16,

@@ -86,26 +86,41 @@ def open_folder(path: str, conditioned: bool) -> Folder:
     return folder
 
 
-def _local(path: str) -> Path:
-    """The local folder of `path`, downloaded where it is an id of the hub that is not there yet."""
+def find_folder(path: str, holds: str, example: str) -> Path | None:
+    """The local folder `path`, or None where it can be an id of the hub. Raises PriorError where it is neither.
+
+    holds: what belongs into the folder; example: an id; both for the message.
+    """
     folder = Path(path).expanduser()
     if folder.is_dir():
         return folder
     if folder.is_absolute() or path.startswith((".", "~")) or len(folder.parts) != 2:
         raise PriorError(
-            f"{path}: no such folder. Give a folder with {', '.join(CONFIGS)}, or a Hugging Face id such as "
-            f"'timbrooks/instruct-pix2pix'."
+            f"{path}: no such folder. Give a folder with {holds}, or a Hugging Face id such as '{example}'."
         )
+    return None
+
+
+def not_given(path: str, error: Exception) -> str:
+    """The message for an id of the hub that could not be had."""
+    return (
+        f"{path}: no such folder here, not in the cache of Hugging Face, and the hub did not give it "
+        f"({type(error).__name__}). Where there is no network, run `hf download {path}` on a machine that has it, "
+        f"copy the folder, and give its path (or set HF_HOME to that cache)."
+    )
+
+
+def _local(path: str) -> Path:
+    """The local folder of `path`, downloaded where it is an id of the hub that is not there yet."""
+    folder = find_folder(path, ", ".join(CONFIGS), "timbrooks/instruct-pix2pix")
+    if folder is not None:
+        return folder
     from diffusers import DiffusionPipeline
 
     try:
         return Path(DiffusionPipeline.download(path, safety_checker=None, feature_extractor=None))
     except Exception as error:  # what the hub raises depends on its version and on its HTTP library
-        raise PriorError(
-            f"{path}: no such folder here, not in the cache of Hugging Face, and the hub did not give it "
-            f"({type(error).__name__}). Where there is no network, run `hf download {path}` on a machine that has it, "
-            f"copy the folder, and give its path (or set HF_HOME to that cache)."
-        ) from error
+        raise PriorError(not_given(path, error)) from error
 
 
 def _read(root: Path, name: str, file: str) -> dict[str, Any]:

@@ -26,6 +26,7 @@ SEGMENTERS.add("files", ".files:Files")
 SEGMENTERS.add("box", ".box:Box")
 SEGMENTERS.add("relevance", ".relevance:Relevance")
 SEGMENTERS.add("text", ".text:Text")
+SEGMENTERS.add("kept", ".kept:Kept")
 
 NONE = "none"
 VOTES = ("weighted", "gaussian-editor")
@@ -36,7 +37,7 @@ EXTRA = "mask"  # the name of the soft weights among a scene's extras, and so in
 class MaskConfig:
     """Where the mask comes from and how it becomes a set of splats: threshold, then grow, then invert, then feather."""
 
-    kind: str = NONE  # none | files | box | relevance | text: what says which part of a picture is meant
+    kind: str = NONE  # none | files | box | relevance | text | kept: what says which part is meant
     options: dict = field(default_factory=dict)  # the kind's own: the fields of segment/<kind>.py
     views: int | None = 24  # views that are looked at, spread evenly over those of training; null: all of them
     vote: str = "weighted"  # by how much of a splat is seen; gaussian-editor: by pixels, as its code does (on the CPU)

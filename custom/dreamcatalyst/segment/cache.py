@@ -85,5 +85,6 @@ def load(folder: Path, key: str) -> tuple[Tensor, dict[int, Tensor]] | None:
             raise ValueError(f"it holds the mask {kept['key']}")
         return kept["weights"], kept["images"]
     except BROKEN as error:
-        plugin.warn(f"{path}: is no mask that can be used and is made again ({str(error).splitlines()[0]})")
+        fault = f"{type(error).__name__}: {str(error).split('. ')[0]}"
+        plugin.warn(f"{path}: is no mask that can be used and is made again ({fault})")
         return None

@@ -57,17 +57,17 @@ class Files(Segmenter):
             else:
                 found[view] = path
         if not found or (lacking and not self.missing):
-            raise DataError(_lacking(folder, lacking, len(request.views)))
+            raise DataError(_lacking(folder, lacking, set(found.values()), len(request.views)))
         return found
 
 
-def _lacking(folder: Path, lacking: list[str], wanted: int) -> str:
-    there = sorted(path.name for path in folder.iterdir() if path.is_file())
+def _lacking(folder: Path, lacking: list[str], taken: set[Path], wanted: int) -> str:
+    there = sorted(path.name for path in folder.iterdir() if path.is_file() and path not in taken)
     names = ", ".join(f"'{name}'" for name in lacking[:SHOWN]) + (" ..." if len(lacking) > SHOWN else "")
     shown = ", ".join(there[:SHOWN]) + (" ..." if len(there) > SHOWN else "") or "nothing"
     return (
-        f"{folder}: no mask for {len(lacking)} of {wanted} views: {names}.{nearest(lacking[0], there)} Found: {shown}. "
-        "Name them after their views, or set mask.options.missing=true to leave these views aside (not all)"
+        f"{folder}: no mask for {len(lacking)} of {wanted} views: {names}.{nearest(lacking[0], there)} "
+        f"Other files: {shown}. Name them after their views, or set mask.options.missing=true to leave these views aside (not all)"
     )
 
 

@@ -13,12 +13,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..diffusion.folder import load
+from ..diffusion.folder import find_folder, load, not_given
 from ..errors import ConfigError, PriorError, SceneError
 from .api import MaskRequest, Segmenter
 from .cache import stamp
 
-REMEDY = "Give a CLIPSeg or Grounding DINO model: a complete folder, or an id that the hub or its local cache has."
+CLIPSEG, DINO, SAM = "clipseg", "grounding-dino", "sam"  # as the models' config.json calls them
+EXAMPLES = {
+    CLIPSEG: "CIDAS/clipseg-rd64-refined",
+    DINO: "IDEA-Research/grounding-dino-tiny",
+    SAM: "facebook/sam-vit-base",
+}
 
 
 @dataclass(frozen=True)
@@ -26,8 +31,8 @@ class Text(Segmenter):
     """Several things are named with full stops between them: "fox head. flowers". All instances of all are merged."""
 
     text: str = ""  # what to look for: things ("fox head"), not an instruction
-    path: str = "CIDAS/clipseg-rd64-refined"  # CLIPSeg or Grounding DINO: folder, or id on Hugging Face
-    sam: str = "facebook/sam-vit-base"  # beside Grounding DINO (such as IDEA-Research/grounding-dino-tiny)
+    path: str = EXAMPLES[CLIPSEG]  # CLIPSeg or Grounding DINO: folder, or id on Hugging Face
+    sam: str = EXAMPLES[SAM]  # cuts out what Grounding DINO finds; CLIPSeg needs none
     threshold: float | None = None  # of a pixel (CLIPSeg: 0.4) or of a box (Grounding DINO: 0.35), in (0,1)
 
     def __post_init__(self) -> None:
@@ -45,7 +50,7 @@ class Text(Segmenter):
         return stamp(self.path), stamp(self.sam)
 
     def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor]:
-        finder = MODELS[model_type(self.path, MODELS)](self, request.scene.means.device)
+        finder = MODELS[model_type(self.path, *MODELS)](self, request.scene.means.device)
         masks = {view: finder(request.render(view).detach().clamp(0, 1)) for view in views}
         if not any(bool(mask.any()) for mask in masks.values()):
             raise SceneError(
@@ -85,7 +90,7 @@ class GroundedSam:
 
         self.words = " ".join(f"{phrase}." for phrase in options.phrases)  # as the model was trained to read them
         self.threshold, self.best = options.threshold or 0.35, 0.0
-        model_type(options.sam, {"sam"})
+        model_type(options.sam, SAM)
         self.processor, self.sam_processor = (_processor(AutoProcessor, path) for path in (options.path, options.sam))
         self.detector = load(GroundingDinoForObjectDetection, options.path, None, torch.float32).to(device)
         self.sam = load(SamModel, options.sam, None, torch.float32).to(device)
@@ -118,19 +123,25 @@ class GroundedSam:
         return masks.flatten(0, 1).any(dim=0).float()
 
 
-MODELS = {"clipseg": ClipSeg, "grounding-dino": GroundedSam}
+MODELS = {CLIPSEG: ClipSeg, DINO: GroundedSam}
 
 
-def model_type(path: str, wanted: Any) -> str:
-    """What kind of model `path` holds, one of `wanted`. Raises PriorError."""
+def model_type(path: str, *wanted: str) -> str:
+    """What kind of model `path` holds (a local folder, or a Hugging Face id that is downloaded once), one of `wanted`.
+
+    Raises PriorError: no such folder, an id that cannot be had, another kind of model.
+    """
     from transformers import AutoConfig
 
+    folder = find_folder(path, "config.json, weights and preprocessor", EXAMPLES[wanted[0]])
     try:
         kind = AutoConfig.from_pretrained(path).model_type
     except (OSError, ValueError, KeyError) as error:
-        raise PriorError(f"{path}: no model can be found ({str(error).splitlines()[0]}). {REMEDY}") from error
+        fault = not_given(path, error) if folder is None else f"{path}: has no config.json of a model that is known."
+        raise PriorError(fault) from error
     if kind not in wanted:
-        raise PriorError(f"{path}: is a '{kind}', expected {' or '.join(sorted(wanted))}. {REMEDY}")
+        good = " or ".join(f"{name} (such as {EXAMPLES[name]})" for name in wanted)
+        raise PriorError(f"{path}: is a '{kind}', expected {good}.")
     return kind
 
 
