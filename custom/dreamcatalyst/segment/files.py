@@ -67,8 +67,8 @@ def _lacking(folder: Path, lacking: list[str], taken: set[Path], wanted: int) ->
     shown = ", ".join(there[:SHOWN]) + (" ..." if len(there) > SHOWN else "") or "nothing"
     return (
         f"{folder}: no mask for {len(lacking)} of {wanted} views: {names}.{nearest(lacking[0], there)} "
-        f"Other files: {shown}. Name them after their views, or set mask.options.missing=true, which leaves views without "
-        "one aside"
+        f"Other files: {shown}. Name them after their views, or set mask.options.missing=true to leave them "
+        "aside"
     )
 
 
