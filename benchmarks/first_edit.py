@@ -30,7 +30,7 @@ def run(folder: Path, name: str, arguments: list[str]) -> dict[str, float]:
         "use_timestamp=false",
         "system.report.video_frames=0",
     ]
-    arguments = ["--config", str(ROOT / "configs" / "dc-ge.yaml"), *options, *arguments]
+    arguments = ["--config", str(ROOT / "configs" / "closed-form.yaml"), *options, *arguments]
     if launch.main(arguments):
         sys.exit(f"{name}: the run failed")
     summary = json.loads((folder / name / "run" / "report" / "summary.json").read_text())

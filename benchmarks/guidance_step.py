@@ -34,11 +34,12 @@ from torch import Tensor
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "custom")]
 
+from dreamcatalyst.cache import ByteCache  # noqa: E402
 from dreamcatalyst.diffusion.api import Prior, Row  # noqa: E402
 from dreamcatalyst.diffusion.autoencoder import Autoencoder, load_autoencoder  # noqa: E402
 from dreamcatalyst.diffusion.folder import open_folder  # noqa: E402
 from dreamcatalyst.diffusion.noise import abar_at, add_noise  # noqa: E402
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig, chosen_rule, chosen_schedule  # noqa: E402
+from dreamcatalyst.guidance.guidance import VIEW_BYTES, Guidance, GuidanceConfig, chosen_rule, chosen_schedule  # noqa: E402
 
 from tests.diffusion.small_model import FULL, SMALL, make_model, make_tiny_autoencoder  # noqa: E402
 
@@ -105,7 +106,7 @@ def with_rule(guidance: Guidance, rule: str) -> Guidance:
 def with_prior(guidance: Guidance, **changes: Any) -> Guidance:
     """The same U-Net behind an autoencoder of its own. changes: max_rows, autoencoder, checkpointing of the prior."""
     other, prior = copy.copy(guidance), copy.copy(guidance.prior)
-    other.prior, other._views = prior, {}
+    other.prior, other._views = prior, ByteCache(VIEW_BYTES)
     prior.config = replace(prior.config, **changes)
     prior.max_rows = prior.config.max_rows
     folder = open_folder(prior.config.path, conditioned=True)
@@ -136,10 +137,15 @@ def plain_step(
     images, originals = (2 * each.permute(0, 3, 1, 2).to(dtype) - 1 for each in (rgb, source))
     with clock.stage("encode"):
         x = vae.encode(images).latent_dist.mode().float() * scale
-        if again or VIEW not in guidance._views:
-            latents = vae.encode(originals).latent_dist.mode().float() * scale
-            guidance._views[VIEW] = latents, vae.encode(originals).latent_dist.mode()
-    x_src, condition = guidance._views[VIEW]
+        if again:
+            guidance._views.clear()
+        x_src, condition = guidance._views.get(
+            VIEW,
+            lambda: (
+                vae.encode(originals).latent_dist.mode().float() * scale,
+                vae.encode(originals).latent_dist.mode(),
+            ),
+        )
     timestep = guidance.schedule.timestep(step, LENGTH, prior.alphas_cumprod)
     noise, abar = guidance._noise(x, [VIEW], step), abar_at(prior.alphas_cumprod, timestep)
     null = prior.embed([""])[0]

@@ -274,7 +274,7 @@ def test_a_run_that_cannot_be_is_refused(written, text, arguments, said):
 
 
 def test_a_missing_file_is_named_with_its_nearest_neighbour(written, tmp_path, monkeypatch):
-    there = written("name: x", "dc-ge.yaml")
+    there = written("name: x", "closed-form.yaml")
     with pytest.raises(ConfigError, match=f"there is no file '{tmp_path}/dc-eg.yaml'. Did you mean '{there}'"):
         load_config(tmp_path / "dc-eg.yaml")
 

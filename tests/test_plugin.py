@@ -162,7 +162,7 @@ def test_a_host_that_is_too_old_is_told_so(host):
 
 
 def in_host(host: Path, *arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "launch.py", "--config", "configs/dreamcatalyst/dc-ge.yaml", *arguments]
+    command = [sys.executable, "launch.py", "--config", "configs/dreamcatalyst/closed-form.yaml", *arguments]
     return subprocess.run(command, cwd=host, capture_output=True, text=True)
 
 

@@ -8,7 +8,7 @@ import torch
 
 import launch
 
-CONFIG = Path(launch.__file__).parent / "configs/dc-ge.yaml"
+CONFIG = Path(launch.__file__).parent / "configs/closed-form.yaml"
 OPTIONS = [
     "name=t", "tag=t", "use_timestamp=false", "trainer.accelerator=cpu", "system.guidance.rule=in2n", "data.width=32",
     "system.guidance.per_editing_step=0", "system.guidance.diffusion_steps=2", "data.height=32", "data.max_view_num=2",

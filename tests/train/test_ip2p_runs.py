@@ -64,7 +64,7 @@ def calls(monkeypatch):
     ],
 )
 def test_the_unet_sees_only_rows_that_matter_and_never_a_graph(launch, models, calls, prior_type, rule, more, wanted):
-    trial = launch("dc-ge.yaml", "trainer.max_steps=2", *on(models, prior_type, rule, *more))
+    trial = launch("closed-form.yaml", "trainer.max_steps=2", *on(models, prior_type, rule, *more))
     assert calls == [(images, False) for images in wanted]
     assert read_ply(trial / "save" / "last.ply").sh0.isfinite().all()
 
@@ -73,12 +73,12 @@ def test_the_unet_sees_only_rows_that_matter_and_never_a_graph(launch, models, c
 def test_a_resumed_run_on_a_learned_prior_has_the_bits_of_an_uninterrupted_one(launch, models, rule, latents):
     more = [f"system.guidance.prior.latents={latents}", "system.guidance.diffusion_steps=2", "trainer.max_steps=6"]
     options = on(models, "ip2p", rule, *more, "checkpoint.every_n_train_steps=4")
-    whole = launch("dc-ge.yaml", *options, name="whole")
+    whole = launch("closed-form.yaml", *options, name="whole")
     (checkpoint,) = (whole / "ckpts").glob("*step=4.ckpt")
     kept = whole.parents[1] / "resumed" / "trial" / "ckpts" / checkpoint.name
     kept.parent.mkdir(parents=True)
     kept.write_bytes(checkpoint.read_bytes())
-    resumed = launch("dc-ge.yaml", *options, f"resume={kept}", name="resumed")
+    resumed = launch("closed-form.yaml", *options, f"resume={kept}", name="resumed")
     one, other = (read_ply(trial / "save" / "last.ply") for trial in (whole, resumed))
     assert not torch.equal(one.sh0, read_ply(whole / "save" / "source.ply").sh0)
     for name in EVERY_PARAMETER:
@@ -90,20 +90,20 @@ def test_a_prior_that_will_not_do_is_found_before_the_scene(launch, models, caps
     wrong = [("nowhere/at/all", "ip2p", "no such folder"), (models["ip2p"], "sd", "use prior 'ip2p'")]
     for path, prior_type, words in wrong:
         options = [f"system.guidance.prior={{path: {path}}}", f"system.guidance.prior_type={prior_type}", *WORDS]
-        launch("dc-ge.yaml", *options, "system.guidance.rule=sds", "system.gs_source=nowhere.ply", status=2)
+        launch("closed-form.yaml", *options, "system.guidance.rule=sds", "system.gs_source=nowhere.ply", status=2)
         error = capsys.readouterr().err
         assert words in error and "nowhere.ply" not in error and "Traceback" not in error
 
 
 def test_rules_of_the_image_row_refuse_a_text_to_image_model_by_name(launch, models, capsys):
     for rule in ("dreamcatalyst", "dreamcatalyst-psi2", "dreamcatalyst-psi3", "csd-like", "in2n"):
-        launch("dc-ge.yaml", *on(models, "sd", rule), "trainer.max_steps=1", status=2)
+        launch("closed-form.yaml", *on(models, "sd", rule), "trainer.max_steps=1", status=2)
         assert f"rule '{rule}'" in capsys.readouterr().err
 
 
 def test_a_checkpoint_of_a_fit_is_no_edit_to_go_on_from(launch, capsys):
     fit = launch("fit.yaml", "trainer.max_steps=1", name="fit")
-    launch("dc-ge.yaml", "trainer.max_steps=2", f"resume={fit / 'ckpts' / 'last.ckpt'}", status=2)
+    launch("closed-form.yaml", "trainer.max_steps=2", f"resume={fit / 'ckpts' / 'last.ckpt'}", status=2)
     error = capsys.readouterr().err
     assert "resume: the checkpoint is of a run without guidance" in error and "system.gs_source" in error
     assert "Traceback" not in error

@@ -46,7 +46,7 @@ def test_a_fit_approaches_its_photographs_and_leaves_everything(launch):
 
 
 def test_an_edit_approaches_the_edit_that_the_prior_knows(launch):
-    trial = launch("dc-ge.yaml", "trainer.max_steps=60", "data.batch_size=2", "system.report.every=30")
+    trial = launch("closed-form.yaml", "trainer.max_steps=60", "data.batch_size=2", "system.report.every=30")
     curve = rows(trial)
     assert curve[-1]["psnr_edit"] > curve[0]["psnr_edit"] + 3
     assert curve[-1]["psnr_source"] < 40
@@ -58,17 +58,20 @@ def test_cameras_of_another_scene_are_warned_of(launch, tmp_path, capsys):
     statue = make_world("statue").scene
     other = write_ply(tmp_path / "other.ply", statue[::100])
     same = write_ply(tmp_path / "same.ply", statue)
-    launch("dc-ge.yaml", "trainer.max_steps=1", f"system.gs_source={same}")
+    launch("closed-form.yaml", "trainer.max_steps=1", f"system.gs_source={same}")
     assert "belong together" not in capsys.readouterr().err
-    launch("dc-ge.yaml", "trainer.max_steps=1", f"system.gs_source={other}")
+    launch("closed-form.yaml", "trainer.max_steps=1", f"system.gs_source={other}")
     assert "belong together" in capsys.readouterr().err
-    launch("dc-ge.yaml", "trainer.max_steps=1", f"system.gs_source={other}", "data.source=")
+    launch("closed-form.yaml", "trainer.max_steps=1", f"system.gs_source={other}", "data.source=")
     assert "belong together" not in capsys.readouterr().err
 
 
 def test_the_null_edit_leaves_the_scene_alone(launch):
     trial = launch(
-        "dc-ge.yaml", "trainer.max_steps=4", "system.guidance.guidance_scale=0", "system.guidance.noise=independent"
+        "closed-form.yaml",
+        "trainer.max_steps=4",
+        "system.guidance.guidance_scale=0",
+        "system.guidance.noise=independent",
     )
     source, last = read_ply(trial / "save" / "source.ply"), read_ply(trial / "save" / "last.ply")
     for name in EVERY_PARAMETER:
@@ -78,7 +81,7 @@ def test_the_null_edit_leaves_the_scene_alone(launch):
 @pytest.mark.parametrize(
     ("config", "options"),
     [
-        ("dc-ge.yaml", ["data.batch_size=2"]),
+        ("closed-form.yaml", ["data.batch_size=2"]),
         ("fit.yaml", ["system.densify.start=2", "system.densify.every=2", "system.densify.grad_threshold=1e-6"]),
     ],
 )
@@ -105,20 +108,20 @@ def test_a_densify_step_keeps_its_update(launch):
 
 
 def test_validate_and_export_work_from_a_ply_and_from_a_checkpoint(launch, capsys):
-    trial = launch("dc-ge.yaml", "trainer.max_steps=2")
-    launch("dc-ge.yaml", f"resume={trial / 'ckpts' / 'last.ckpt'}", mode="--validate")
+    trial = launch("closed-form.yaml", "trainer.max_steps=2")
+    launch("closed-form.yaml", f"resume={trial / 'ckpts' / 'last.ckpt'}", mode="--validate")
     assert "psnr_edit" in capsys.readouterr().out
     launch("fit.yaml", f"system.gs_source={trial / 'save' / 'last.ply'}", mode="--validate", name="fit")
     assert "psnr_photo" in capsys.readouterr().out
     video = "system.report.video_frames=3"
-    launch("dc-ge.yaml", f"resume={trial / 'ckpts' / 'last.ckpt'}", video, mode="--export")
+    launch("closed-form.yaml", f"resume={trial / 'ckpts' / 'last.ckpt'}", video, mode="--export")
     export = trial / "save" / "it2-export"
     assert (export / "point_cloud.ply").is_file() and (export / "video.mp4").stat().st_size > 0
 
 
 def test_preview_draws_a_grid_without_a_run(launch):
     trial = launch(
-        "dc-ge.yaml",
+        "closed-form.yaml",
         "system.preview.prompts=[Make it night, Make it autumn]",
         "system.preview.guidance_scales=[1,7.5]",
         mode="--preview",
@@ -142,7 +145,7 @@ def test_preview_draws_a_grid_without_a_run(launch):
     ],
 )
 def test_wrong_input_is_one_clear_error(launch, capsys, override, words):
-    launch("dc-ge.yaml", "trainer.max_steps=2", override, status=2)
+    launch("closed-form.yaml", "trainer.max_steps=2", override, status=2)
     error = capsys.readouterr().err
     assert words in error and "Traceback" not in error
 
@@ -194,13 +197,13 @@ def test_a_run_that_time_ends_leaves_a_checkpoint(launch):
 
 
 def test_a_checkpoint_of_another_system_is_refused(launch, capsys):
-    trial = launch("dc-ge.yaml", "trainer.max_steps=1")
+    trial = launch("closed-form.yaml", "trainer.max_steps=1")
     launch("fit.yaml", f"resume={trial / 'ckpts' / 'last.ckpt'}", "trainer.max_steps=2", status=2)
     assert "EditSystem" in capsys.readouterr().err
 
 
 def test_an_infinite_score_is_null_in_the_summary(launch):
-    trial = launch("dc-ge.yaml", "trainer.max_steps=1", "trainer.limit_train_batches=1", mode="--test")
+    trial = launch("closed-form.yaml", "trainer.max_steps=1", "trainer.limit_train_batches=1", mode="--test")
     text = (trial / "report" / "summary.json").read_text()
     assert json.loads(text)["mean"]["psnr_source"] is None and "Infinity" not in text
 

@@ -44,6 +44,11 @@ class Prior(ABC):
     takes_image: bool = True
     exact: bool = False
 
+    @property
+    def weight_bytes(self) -> int:
+        """Memory of the weights; 0 for a prior without any."""
+        return 0
+
     @abstractmethod
     def encode(self, images: Tensor) -> Tensor:
         """Images to scaled latents, differentiable in `images` [B,3,H,W] in [0,1]."""

@@ -110,6 +110,11 @@ class LatentDiffusion(Prior):
         self._embeddings: dict[str, Tensor] = {}
         self.null_text: Tensor | None = None  # [L,D] in place of the empty prompt's, such as a negative prompt's
 
+    @property
+    def weight_bytes(self) -> int:
+        models = self.unet, self.text_encoder, self.autoencoder.vae
+        return sum(p.numel() * p.element_size() for model in models for p in model.parameters())
+
     def _apply_options(self, vae: nn.Module) -> None:
         if self.config.slicing:
             vae.enable_slicing()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..diffusion.api import Prior
-from ..diffusion.combine import Branch, predict_difference
+from ..diffusion.combine import Branch, difference_rows, predict_difference
 from ..diffusion.noise import abar_at, add_noise
 from ..errors import ConfigError, NumericalError, PriorError
 from .rules import EDIT_NULL, NOISE, SOURCE, SOURCE_NULL, Rule
@@ -54,6 +54,20 @@ def distillation_gradient(
         gradient += b * (x - x_src)
     _check_finite(rule, gradient, timestep)
     return gradient
+
+
+def network_rows(
+    prior: Prior, rule: Rule, text: Any, source_text: Any, guidance_scale: float, image_guidance_scale: float
+) -> int:
+    """How many rows one step of the rule asks of the prior for each view (each step of an edit, for a rule that
+    delivers one)."""
+    if rule.delivers == "known edit":
+        return 0
+    latents, other = torch.zeros(1), torch.zeros(1)
+    edit = Branch(latents, text, object(), guidance_scale, image_guidance_scale)
+    gradient = rule.delivers == "gradient"
+    reference = _reference(rule, edit, other, torch.zeros(1), 0.5, source_text) if gradient else None
+    return len(difference_rows(edit, reference, prior.takes_image))
 
 
 def _reference(

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..cache import ByteCache
 from ..config import parse
 from ..diffusion.api import PRIORS, Prior
 from ..diffusion.noise import keyed_noise
@@ -21,6 +22,7 @@ from .rules import SOURCE, Rule, get_rule
 from .timesteps import Schedule
 
 NOISES = ("independent", "alternating", "paired")
+VIEW_BYTES = 2**30  # of latents and conditions of source views that are kept at most
 
 
 @dataclass(frozen=True)
@@ -55,11 +57,13 @@ class Step:
 
     loss: a scalar with a graph to the renders. timestep: index into the prior's schedule, -1 where the rule compares
     images. gradient: the rule's g on latents [B,C,h,w], or the difference of the images [B,H,W,3]; without graph.
+    target: the images [B,H,W,3] that renders are compared with, None for a rule that delivers a gradient.
     """
 
     loss: Tensor
     timestep: int
     gradient: Tensor
+    target: Tensor | None = None
 
     @property
     def gradient_rms(self) -> float:
@@ -108,7 +112,7 @@ class Guidance:
         compared = source_prompt if self.rule.reference == SOURCE else ""  # other rules never look at it
         self.source_text = self.prior.embed([compared])[0] if compared else None
         self.edits = EditedViews(config.per_editing_step, config.edit_min_percent, config.edit_max_percent, config.seed)
-        self._views: dict[int, tuple[Tensor, Any]] = {}
+        self._views = ByteCache(VIEW_BYTES)
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -128,11 +132,10 @@ class Guidance:
 
     @torch.no_grad()
     def view(self, source: Tensor, index: int) -> tuple[Tensor, Any]:
-        """Latents [1,C,h,w] and condition of a view's source render [H,W,3]; computed once for each `index`."""
-        if index not in self._views:
-            image = source.permute(2, 0, 1)[None]
-            self._views[index] = self.prior.encode(image), self.prior.condition(image)
-        return self._views[index]
+        """Latents [1,C,h,w] and condition of a view's source render [H,W,3]; computed once for each `index`, as
+        long as there is room (1 GiB)."""
+        image = source.permute(2, 0, 1)[None]
+        return self._views.get(index, lambda: (self.prior.encode(image), self.prior.condition(image)))
 
     def step(
         self,
@@ -209,8 +212,9 @@ class Guidance:
             if self.edits.due(view, step):
                 self.edits.put(view, self.edit(render, source, view, step))
             targets.append(self.edits.get(view, like=rgb))
-        difference = rgb - torch.stack(targets)
-        return Step(difference.abs().mean(), -1, difference.detach())
+        target = torch.stack(targets)
+        difference = rgb - target
+        return Step(difference.abs().mean(), -1, difference.detach(), target)
 
     def edit_by_rule(self, render: Tensor, source: Tensor, index: int, step: int) -> Tensor:
         """A finished picture of one view, [H,W,3] in [0,1], in `diffusion_steps` steps: the rule as a sampler from the

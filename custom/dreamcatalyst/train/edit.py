@@ -11,14 +11,21 @@ import torch
 from torch import Tensor
 
 from .. import plugin
+from ..cache import ByteCache
 from ..data.camera import Cameras
 from ..errors import ConfigError, SceneError, choose
 from ..guidance.guidance import Guidance, GuidanceConfig
+from ..loss.anchor import AnchorConfig, anchor_loss, anchor_step
+from ..loss.perceptual import Lpips
 from ..render.api import Render
-from ..report.metrics import psnr
+from ..report.metrics import METRICS, psnr
 from ..report.pictures import write_png
+from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
-from ..scene.ply import write_ply
+from ..scene.ply import read_ply, write_ply
+from ..segment.api import MaskConfig
+from .confine import confine, seen_mask
+from .plan import edit_plan
 from .preview import PreviewConfig, preview_sheet
 from .system import SplatSystem
 
@@ -37,6 +44,25 @@ class PromptConfig:
             raise ConfigError('prompt: is empty. Say what is wanted, e.g. prompt="Make it sunset".')
 
 
+@dataclass(frozen=True)
+class LossConfig:
+    """What is minimised, as a sum of terms; the anchors' weights stand in `anchor`."""
+
+    lambda_guidance: float = 1.0  # of the rule's loss (GaussianEditor's lambda_l1 = 10 for pictures)
+    lambda_perceptual: float = 0.0  # of LPIPS, for rules that deliver a picture (GaussianEditor's lambda_p = 10)
+    perceptual_weights: str = ""  # a folder with VGG-16's and LPIPS's weight files (loss/perceptual.py)
+
+    def __post_init__(self) -> None:
+        for name in ("lambda_guidance", "lambda_perceptual"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, expected 0 or more.")
+        if self.lambda_perceptual and not self.perceptual_weights:
+            raise ConfigError(
+                "perceptual_weights: is empty. LPIPS needs the folder that holds its two weight files; or set "
+                "lambda_perceptual=0"
+            )
+
+
 @plugin.register("dreamcatalyst-edit-system")
 class EditSystem(SplatSystem):
     """Edits the splats of gs_source (or of a made world) as the instruction says."""
@@ -46,6 +72,9 @@ class EditSystem(SplatSystem):
         "guidance": GuidanceConfig,
         "prompt_processor": PromptConfig,
         "preview": PreviewConfig,
+        "mask": MaskConfig,
+        "anchor": AnchorConfig,
+        "loss": LossConfig,
     }
 
     @dataclass
@@ -55,6 +84,10 @@ class EditSystem(SplatSystem):
         guidance: dict = field(default_factory=dict)
         prompt_processor: dict = field(default_factory=dict)
         preview: dict = field(default_factory=dict)
+        original: str = ""  # a PLY of the scene before any edit, where gs_source is an edited one; empty: gs_source
+        mask: dict = field(default_factory=dict)  # where the edit may take place
+        anchor: dict = field(default_factory=dict)  # what splats are held to, by generation
+        source_cache_mib: int = 1024  # what is kept of renders of the source
 
     def configure(self) -> None:
         super().configure()
@@ -62,7 +95,9 @@ class EditSystem(SplatSystem):
             choose("mode", self.cfg.mode, self.cfg.steps, "system.mode")
         self.guidance: Guidance | None = None
         self.source: Gaussians | None = None
-        self._source_renders: dict[int, Tensor] = {}
+        self.perceptual: Lpips | None = None
+        self.generations = self.part["anchor"].generations()
+        self._source_renders = ByteCache(self.cfg.source_cache_mib * 2**20)
 
     def setup(self, stage: str) -> None:
         self.prepare()
@@ -71,24 +106,49 @@ class EditSystem(SplatSystem):
             write_ply(self.save_path("source.ply"), self.source.to("cpu"))
             self.compare_with_photos()
 
+    def on_train_start(self) -> None:
+        plan = edit_plan(self)
+        plan.write(self.report_dir / "plan.json")
+        plugin.info(plan.text())
+        super().on_train_start()
+
     def prepare(self) -> None:
         """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""
         if self.guidance is None:
             words: PromptConfig = self.part["prompt_processor"]
             self.guidance = Guidance(self.part["guidance"], words.prompt, words.source_prompt, device=self.root_device)
+        losses: LossConfig = self.part["loss"]
+        if losses.lambda_perceptual and self.perceptual is None:
+            if self.guidance.rule.delivers == "gradient":
+                raise ConfigError(
+                    f"system.loss.lambda_perceptual: rule '{self.guidance.rule.name}' delivers no picture to compare "
+                    "with. Set it to 0, or use the rule in2n."
+                )
+            self.perceptual = Lpips(losses.perceptual_weights, self.root_device, "system.loss.perceptual_weights")
         if self.source is None:
-            self.source = self.given_scene().to(self.root_device)
+            given = self.given_scene() if not self.cfg.original else read_ply(self.cfg.original)
+            self.source = given.to(self.root_device)
 
     def first_scene(self) -> Gaussians:
-        return self.source
+        return self.given_scene() if self.cfg.original else self.source
+
+    def make_splats(self, scene: Gaussians) -> Splats:
+        state, editable = {}, None
+        if self.part["mask"].kind != "none" and not self.resumed:  # a checkpoint knows what is editable
+            scene, state, editable = confine(self, scene)
+        splats = Splats(scene, state, editable)
+        if self.generations is not None:
+            self.generations.begin(splats)
+        return splats
+
+    def after_update(self) -> None:
+        anchor_step(self.splats, self.generations, self.part["anchor"])
 
     @torch.no_grad()
     def source_render(self, index: int) -> Tensor:
         """The render of the source scene at one view, [H,W,3], drawn once. As renders of the edit it is not clamped:
         where nothing was edited, the two must be equal to the bit."""
-        if index not in self._source_renders:
-            self._source_renders[index] = self.draw(self.source, self.camera(index)).rgb[0]
-        return self._source_renders[index]
+        return self._source_renders.get(index, lambda: self.draw(self.source, self.camera(index)).rgb[0])
 
     def compare_with_photos(self) -> None:
         """Warn where renders of the source have nothing to do with the photographs of the same cameras; a made world's
@@ -111,15 +171,24 @@ class EditSystem(SplatSystem):
             )
 
     def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[Tensor, Render, dict[str, float]]:
-        index = batch["index"]
-        render = self.draw(self.splats.scene, self.camera(index))
+        index, losses = batch["index"], self.part["loss"]
+        render = self.draw_now(self.camera(index))
         sources = torch.stack([self.source_render(i) for i in index])
         given = self.guidance.step(render.rgb, sources, index, step, self.max_steps, batch.get("visit"))
-        return given.loss, render, {"t": given.timestep, "gradient": given.gradient_rms}
+        loss, numbers = losses.lambda_guidance * given.loss, {"t": given.timestep, "gradient": given.gradient_rms}
+        if self.perceptual is not None:
+            distance = self.perceptual(render.rgb, given.target)
+            loss, numbers["perceptual"] = loss + losses.lambda_perceptual * distance, float(distance.detach())
+        if self.generations is not None:
+            pull = anchor_loss(self.splats, self.generations, self.part["anchor"])
+            loss, numbers["anchor"] = loss + pull, float(pull.detach())
+        return loss, render, numbers
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_save_checkpoint(checkpoint)
         checkpoint["guidance"] = self.guidance.state_dict()
+        if self.generations is not None:
+            checkpoint["generations"] = self.generations.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if "guidance" not in checkpoint:
@@ -129,6 +198,8 @@ class EditSystem(SplatSystem):
             )
         super().on_load_checkpoint(checkpoint)
         self.guidance.load_state_dict(checkpoint["guidance"])
+        if self.generations is not None:
+            self.generations.load_state_dict(checkpoint.get("generations", {"weights": []}), self.splats)
 
     def references(self, index: int) -> dict[str, Tensor]:
         source = self.source_render(index)
@@ -138,6 +209,20 @@ class EditSystem(SplatSystem):
         rest = self.guidance.expected(source, index)
         return {"edit": known, **({} if rest is None else {"fixed_point": rest}), "source": source}
 
+    def score(self, index: int) -> dict[str, float]:
+        """As for every system; where the edit is confined, also inside the mask against the prior's edit, and outside
+        of it against the source."""
+        scores = super().score(index)
+        if self.splats.frozen is None:
+            return scores
+        image, inside = self.picture(index)[None], seen_mask(self, index)[None].round()
+        for name, reference in self.references(index).items():
+            where, weight = ("outside", 1 - inside) if name == "source" else ("inside", inside)
+            if bool(weight.any()):  # a view may show nothing of either
+                values = (image, reference.to(image)[None].clamp(0, 1), weight)
+                scores |= {f"{m}_{name}_{where}": float(METRICS.get(m)(*values)) for m in ("psnr", "ssim", "l1")}
+        return scores
+
     def panels(self, index: int) -> list[tuple[str, Tensor]]:
         source = self.source_render(index)
         known = self.guidance.known_edit(source, index)
@@ -145,7 +230,7 @@ class EditSystem(SplatSystem):
         return shown if known is None else [*shown, ("the prior's edit", known)]
 
     def video_frame(self, cameras: Cameras) -> list[tuple[str, Tensor]]:
-        edited = self.draw(self.splats.scene.detach(), cameras).rgb[0]
+        edited = self.draw_now(cameras).rgb[0]
         return [("source", self.draw(self.source, cameras).rgb[0]), ("edited", edited)]
 
     def preview(self, data: Any) -> list[Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,10 +14,27 @@ import torch
 
 from .. import plugin
 from ..data.views import Capture
+from ..errors import ConfigError
 from ..report.pictures import picture_row, write_png, write_video
 
 if TYPE_CHECKING:
     from .system import SplatSystem
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """What is measured and written beside the result."""
+
+    every: int = 50  # steps between two rows of the error curve; 0: first and last step only
+    views: int = 4  # held-out views that each row is measured on
+    pictures: int = 8  # comparisons written at the end
+    video_frames: int = 72  # 0: no video
+    video_fps: int = 24
+
+    def __post_init__(self) -> None:
+        for name, least in dict(every=0, views=1, pictures=0, video_frames=0, video_fps=1).items():
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name}: got {getattr(self, name)}, expected {least} or more.")
 
 
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -26,8 +44,10 @@ def mean_scores(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def score_table(scores: Mapping[int, Mapping[str, float]], capture: Capture) -> str:
-    """One line per view and the mean, as text."""
+    """One line per view and the mean, as text; of an edit that is confined, what says something about it."""
     columns = list(mean_scores(list(scores.values())))
+    if any(c.endswith("_outside") for c in columns):
+        columns = [c for c in columns if c.endswith(("_inside", "_outside")) and not c.startswith("l1")]
     if not columns:
         return "no scores: there is nothing to compare with"
     width = max(8, *(len(capture.views[i].name) for i in scores))
@@ -35,7 +55,7 @@ def score_table(scores: Mapping[int, Mapping[str, float]], capture: Capture) -> 
     lines = [" ".join([" " * width, *(f"{c:>{w}}" for c, w in zip(columns, widths, strict=True))])]
     rows = {capture.views[i].name: score for i, score in scores.items()} | {"mean": mean_scores(list(scores.values()))}
     for name, score in rows.items():
-        values = (f"{score[c]:>{w}.3f}" for c, w in zip(columns, widths, strict=True))
+        values = (f"{score[c]:>{w}.3f}" if c in score else f"{'-':>{w}}" for c, w in zip(columns, widths, strict=True))
         lines.append(" ".join([f"{name:<{width}}", *values]))
     return "\n".join(lines)
 

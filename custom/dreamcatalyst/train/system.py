@@ -18,15 +18,18 @@ from ..data.views import Capture
 from ..diffusion.noise import keyed_generator
 from ..errors import ConfigError, NumericalError, SceneError
 from ..render.api import Render, rasterize
+from ..render.frozen import Frozen
 from ..report.curve import Curve
 from ..report.metrics import METRICS
 from ..report.pictures import picture_row, write_png
 from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
+from ..scene.generations import Generations
 from ..scene.ply import read_ply, write_ply
 from . import results
 from .densify import STATISTICS, DensifyConfig, densify, observe, reset_opacity, screen_statistics
 from .optim import LearningRates
+from .results import ReportConfig
 
 
 @dataclass(frozen=True)
@@ -36,26 +39,13 @@ class RendererConfig:
     backend: str = "auto"  # reference | cpu | gsplat; auto: by the device
     antialiased: bool = False  # Mip-Splatting's 2D filter
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0,1]
+    cache_mib: int = 1024  # what is kept of renders of splats that never change; the least recently used goes
 
     def __post_init__(self) -> None:
+        if self.cache_mib < 0:
+            raise ConfigError(f"cache_mib: got {self.cache_mib}, expected 0 or more MiB.")
         if not all(0 <= value <= 1 for value in self.background):
             raise ConfigError(f"background: got {self.background}, expected red, green and blue in [0,1].")
-
-
-@dataclass(frozen=True)
-class ReportConfig:
-    """What is measured and written beside the result."""
-
-    every: int = 50  # steps between two rows of the error curve; 0: first and last step only
-    views: int = 4  # held-out views that each row is measured on
-    pictures: int = 8  # comparisons written at the end
-    video_frames: int = 72  # 0: no video
-    video_fps: int = 24
-
-    def __post_init__(self) -> None:
-        for name, least in dict(every=0, views=1, pictures=0, video_frames=0, video_fps=1).items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected {least} or more.")
 
 
 class SplatSystem(plugin.BaseSystem):
@@ -93,12 +83,21 @@ class SplatSystem(plugin.BaseSystem):
         """What the render of a view is compared with, by name: [H,W,3] each, the first one being the aim."""
         return {}
 
+    def make_splats(self, scene: Gaussians) -> Splats:
+        """The trainable form of `scene`."""
+        return Splats(scene)
+
+    def after_update(self) -> None:
+        """What else moves splats in a step, after the optimizer has."""
+
     # --- setting up
 
     def configure(self) -> None:
         self.automatic_optimization = False
         self.part = {name: parse(cls, getattr(self.cfg, name), f"system.{name}") for name, cls in self.parts.items()}
         self.splats: Splats | None = None
+        self.generations: Generations | None = None  # of hierarchical splats, where a subclass keeps them
+        self._frozen: tuple[Gaussians | None, Frozen | None] = None, None
         self._data: Any = None  # a data module, where there is no trainer to ask for it
         self.curve, self._seconds, self._started = Curve(), 0.0, None
         self._numbers: dict[str, float] = {}
@@ -107,13 +106,8 @@ class SplatSystem(plugin.BaseSystem):
     def setup(self, stage: str) -> None:
         if self.splats is None:
             self.splats = self.make_splats(self.first_scene().to(self.root_device))
+            self.splats.state.update(screen_statistics(self.splats))
         _ = self.capture  # opened here, since after this Lightning asks for the loaders of any stage
-
-    def make_splats(self, scene: Gaussians) -> Splats:
-        """The trainable form of `scene`, with all per-splat state that this system keeps."""
-        splats = Splats(scene)
-        splats.state.update(screen_statistics(splats))
-        return splats
 
     def given_scene(self) -> Gaussians:
         """The splats of gs_source, or of the made world. Raises ConfigError where there are neither."""
@@ -133,7 +127,9 @@ class SplatSystem(plugin.BaseSystem):
     @property
     def capture(self) -> Capture:
         """The run's views."""
-        return self.data.open(self.splats.scene.detach() if self.splats else None, self.cfg.gs_source)
+        if self.data.capture is None:
+            self.data.open(self.splats.scene.detach() if self.splats else None, self.cfg.gs_source)
+        return self.data.capture
 
     @property
     def root_device(self) -> torch.device:
@@ -156,10 +152,23 @@ class SplatSystem(plugin.BaseSystem):
             **options,
         )
 
+    @property
+    def frozen(self) -> Frozen | None:
+        """The splats that never change, with what is kept of their renders."""
+        given = self.splats.frozen
+        if given is not self._frozen[0]:
+            limit = self.part["renderer"].cache_mib * 2**20
+            self._frozen = given, None if given is None else Frozen(given, limit)
+        return self._frozen[1]
+
+    def draw_now(self, cameras: Cameras) -> Render:
+        """Render the splats of the moment, differentiable in the editable ones."""
+        return self.draw(self.splats.edited, cameras, frozen=self.frozen)
+
     @torch.no_grad()
     def picture(self, index: int) -> Tensor:
         """The present render of one view, [H,W,3] in [0,1]."""
-        return self.draw(self.splats.scene.detach(), self.camera(index)).rgb[0].clamp(0, 1)
+        return self.draw_now(self.camera(index)).rgb[0].clamp(0, 1)
 
     # --- training
 
@@ -205,7 +214,9 @@ class SplatSystem(plugin.BaseSystem):
             for name, value in self.splats.parameters.items():
                 if value.grad is not None and not torch.isfinite(value.grad.sum()):
                     raise self._not_finite(f"the gradient of {name} is not finite", step, batch)
-        optimizer.step()
+        with self.splats.scaled_update():
+            optimizer.step()
+            self.after_update()
         self._density_control(step + 1)
         self._numbers = {"loss": float(loss.detach()), **numbers}
 
@@ -216,7 +227,8 @@ class SplatSystem(plugin.BaseSystem):
     def _density_control(self, step: int) -> None:
         config: DensifyConfig = self.part["densify"]
         if config.every and config.start <= step < config.stop and step % config.every == 0:
-            densify(self.splats, config, self.capture.extent, keyed_generator(self.cfg.seed, "split", step))
+            generator = keyed_generator(self.cfg.seed, "split", step)
+            densify(self.splats, config, self.capture.extent, generator, self.generations)
         if config.reset_every and step < config.stop and step % config.reset_every == 0:
             reset_opacity(self.splats)
 

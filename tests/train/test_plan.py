@@ -1,0 +1,108 @@
+"""The plan of an edit, held against what the run really built and did."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from dreamcatalyst.train import edit
+from dreamcatalyst.train.plan import Plan, readable, scene_bytes
+
+from tests.train.test_confined import ANCHORED, MASK
+
+ROWS = ["system.guidance.noise=independent"]
+
+
+def tensor_size(*tensors: torch.Tensor) -> int:
+    return sum(t.numel() * t.element_size() for t in tensors)
+
+
+@pytest.fixture
+def run(launch, monkeypatch) -> Callable[..., tuple[edit.EditSystem, Plan, dict]]:
+    """Launch and return the system after the run, its plan, and what was counted in its last step."""
+
+    def go(*options: str):
+        seen: dict = {"rows": 0, "pixels": 0}
+        real = edit.edit_plan
+
+        def spy(system):
+            seen["system"], seen["plan"] = system, real(system)
+            predict, draw = system.guidance.prior.predict_noise, system.draw_now
+
+            def counted(rows, timestep):
+                seen["rows"] += sum(len(row.noisy) for row in rows)
+                return predict(rows, timestep)
+
+            def drawn(cameras):
+                render = draw(cameras)
+                if torch.is_grad_enabled():
+                    seen["pixels"] += render.rgb[..., 0].numel()
+                return render
+
+            monkeypatch.setattr(system.guidance.prior, "predict_noise", counted)
+            monkeypatch.setattr(system, "draw_now", drawn)
+            return seen["plan"]
+
+        monkeypatch.setattr(edit, "edit_plan", spy)
+        launch("closed-form.yaml", "trainer.max_steps=1", "system.report.every=0", *options)
+        return seen["system"], seen["plan"], seen
+
+    return go
+
+
+def size(plan: Plan, name: str) -> int:
+    return next(part.bytes for part in plan.builds if part.name == name)
+
+
+@pytest.mark.parametrize(
+    ("options", "rows"),
+    [
+        ([], 10),  # 3 + 2 rows, and each noise with both signs
+        (ROWS, 5),
+        ([*ROWS, "system.guidance.condition_scale=1"], 3),
+        ([*ROWS, "system.guidance.rule=sds"], 3),
+        ([*ROWS, "system.guidance.rule=csd-like"], 2),
+        ([*ROWS, "system.guidance.rule=dds", "data.batch_size=2"], 10),
+        (["system.guidance.rule=known-edit"], 0),
+    ],
+)
+def test_rows_and_pixels_of_a_step(run, options, rows):
+    _, plan, seen = run(*options)
+    assert plan.network_rows == seen["rows"] == rows
+    assert plan.pixels == seen["pixels"]
+
+
+@pytest.mark.parametrize("options", [[], [MASK, "system.mask.feather=0.05"], [MASK, *ANCHORED], ANCHORED])
+def test_memory_is_that_of_the_tensors(run, options):
+    system, plan, _ = run(*options)
+    splats = system.splats
+    values = [t for p in splats.parameters.values() for t in (p, p.grad)]
+    moments = [v for s in splats.optimizer.state.values() for k, v in s.items() if k != "step"]
+    anchors = [v for k, v in splats.state.items() if k.startswith("anchor_") or k == "generation"]
+    state = [v for k, v in splats.state.items() if not (k.startswith("anchor_") or k == "generation")]
+    assert size(plan, "editable splats") == tensor_size(*values, *moments, *state)
+    assert size(plan, "source") == scene_bytes(system.source)
+    if splats.frozen is not None:
+        assert size(plan, "frozen splats") == scene_bytes(splats.frozen) + system.frozen.limit
+    if anchors:
+        assert size(plan, "anchors") == tensor_size(*anchors)
+
+
+def test_what_is_left_out_is_not_there(run):
+    system, plan, _ = run()
+    assert {"frozen splats", "anchors", "perceptual network", "densification"} <= {p.name for p in plan.leaves_out}
+    assert system.splats.frozen is None and system.frozen is None
+    assert system.generations is None and not [k for k in system.splats.state if k.startswith("anchor_")]
+    assert system.perceptual is None
+
+
+def test_an_anchor_is_kept_for_what_weighs_only(run):
+    system, plan, _ = run("system.anchor={kind: source, lambda_color: 0, lambda_geo: 0}")
+    assert {k for k in system.splats.state if k.startswith("anchor_")} == {
+        "anchor_logit_opacities",
+        "anchor_log_scales",
+    }
+    assert {"anchor of means", "anchor of sh0"} <= {p.name for p in plan.leaves_out}
+
+
+def test_sizes_for_people():
+    assert [readable(n) for n in (0, 900, 2048, 3 * 2**30)] == ["0 B", "900 B", "2 KiB", "3 GiB"]
