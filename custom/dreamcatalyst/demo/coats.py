@@ -37,8 +37,17 @@ def soft(x: Tensor, edge: float, width: float) -> Tensor:
     return torch.sigmoid((edge - x) / width)[:, None]
 
 
-def _body(thing: Thing, name: str = "body") -> Solid:
+def _part(thing: Thing, name: str) -> Solid:
     return next(solid for solid in thing.solids if solid.name == name)
+
+
+def _patch(points: Tensor, eye: Solid, head: Solid) -> Tensor:
+    """How dark [n,1] the panda's patch around `eye` is at `points` of the head: an oval that hangs outwards."""
+    middle, away = (eye.center - head.center) @ head.rotation, (points - eye.center) @ head.rotation
+    size = eye.radii[2] / 0.028  # the statue's eye
+    out, up = torch.sign(middle[1]) * away[:, 1] / size - 0.008, away[:, 2] / size + 0.010
+    long, short = (out - up) * 0.7071, (out + up) * 0.7071
+    return soft((long / 0.076).square() + (short / 0.054).square() + (away[:, 0] / size / 0.12).square(), 1.0, 0.12)
 
 
 def panda(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
@@ -50,26 +59,11 @@ def panda(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
     elif solid.name == "eye":  # brown, so that it is seen in its patch
         return points.new_tensor([0.24, 0.18, 0.15]).expand(len(points), 3)
     elif solid.name in ("body", "belly"):
-        height = _body(thing).local(points)[:, 2]
+        height = _part(thing, "body").local(points)[:, 2]
         dark = soft((height - 0.58).abs(), 0.22, 0.025)
     elif solid.name == "head":
-        head = _body(thing, "head")
-        at = (points - head.center) @ head.rotation
-        for eye in (s for s in thing.solids if s.name == "eye"):
-            middle = (eye.center - head.center) @ head.rotation
-            away = at - middle
-            side = 1.0 if middle[1] > 0 else -1.0
-            out, up = side * away[:, 1] + 0.012, away[:, 2] + 0.012  # the patch hangs outwards and down
-            long, short = (out - up) * 0.7071, (out + up) * 0.7071
-            size = eye.radii[2] / 0.028
-            dark = torch.maximum(
-                dark,
-                soft(
-                    (long / 0.075).square() + (short / 0.052).square() + (away[:, 0] / 0.12).square(),
-                    1.0 * size * size,
-                    0.12,
-                ),
-            )
+        for eye in (part for part in thing.solids if part.name == "eye"):
+            dark = torch.maximum(dark, _patch(points, eye, _part(thing, "head")))
     return white * (1 - dark) + black * dark
 
 

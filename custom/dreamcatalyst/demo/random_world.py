@@ -120,9 +120,8 @@ def plant(rng: Generator, light: Light, at: Tensor, size: float) -> tuple[Gaussi
         points, normals, widths = ellipsoid(
             center.tolist(), (0.10 * size, 0.22 * size, reach), max(0.035, 0.1 * size), rotation
         )
-        leaves.append(
-            surface(points, normals, widths, near(green, rng) * light.lit(normals) * mottled(points, rng, 0.1, 0.15))
-        )
+        color = near(green.tolist(), rng) * light.lit(normals) * mottled(points, rng, 0.1, 0.15)
+        leaves.append(surface(points, normals, widths, color))
     return label("pot", pot), label("plant", Gaussians.cat(leaves))
 
 
