@@ -46,7 +46,7 @@ def disc_world() -> DiscWorld:
     drawn = rasterize(scene, cameras, features=truth.float()[:, None])
     guidance = Guidance(GuidanceConfig(), PROMPT)
     request = MaskRequest(
-        scene=scene,
+        scene=scene.with_extra(mask=truth.float()),
         cameras=[cameras[i] for i in range(5)],
         names=[f"photos/{i:04d}.jpg" for i in range(5)],
         views=[0, 1, 2, 4],

@@ -96,7 +96,7 @@ def test_a_box_and_a_sphere_hold_the_centres_inside(disc_world):
         box(disc_world.request, center=[9.0, 0.0, 0.0], radius=0.5)
 
 
-@pytest.mark.parametrize("view, window", [("photos/0003.jpg", "pixels"), ("3", "fractions")])
+@pytest.mark.parametrize("view, window", [("photos/0003.jpg", "pixels"), (3, "fractions")])
 def test_a_rectangle_in_one_view_holds_what_is_visible_there(view, window, disc_world):
     seen = (disc_world.views[3] > 0.5).nonzero()
     (top, left), (bottom, right) = seen.min(dim=0).values, seen.max(dim=0).values + 1
@@ -193,6 +193,16 @@ def test_a_damaged_or_foreign_file_is_made_again(damage, disc_world, tmp_path, c
     assert f"{file}: is no mask that can be used" in caplog.text
     assert torch.equal(first.weights, again.weights)
     assert torch.equal(torch.load(file, weights_only=True)["weights"], first.weights)
+
+
+def test_a_mask_that_came_with_the_splats_is_known_by_its_values(disc_world, tmp_path):
+    config, request = MaskConfig(kind="kept", cache=str(tmp_path)), disc_world.request
+    assert torch.equal(make_mask(config, request).mask, disc_world.truth)
+    other = request.scene.with_extra(mask=1 - disc_world.truth.float())
+    assert torch.equal(make_mask(config, dataclasses.replace(request, scene=other)).mask, ~disc_world.truth)
+    with pytest.raises(SceneError, match="kept needs splats with the property 'mask'"):
+        bare = dataclasses.replace(request.scene, extra={})
+        make_mask(config, dataclasses.replace(request, scene=bare))
 
 
 def test_files_that_change_make_a_new_mask(disc_world, tmp_path):

@@ -35,6 +35,7 @@ def options(disc_world, tmp_path, clipseg):
         "box": {"center": [0.0, 0.0, HEIGHT], "radius": 1.05 * RADIUS},
         "relevance": {},
         "text": {"text": "green disc", "path": str(clipseg)},
+        "kept": {},
     }
 
 

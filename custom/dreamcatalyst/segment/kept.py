@@ -24,3 +24,6 @@ class Kept(Segmenter):
                 f"a mask; these have no such property (further ones: {known}). Choose another kind"
             )
         return request.scene.extra[EXTRA].to(request.scene.means).reshape(-1).clamp(0, 1)
+
+    def identity(self, request: MaskRequest) -> Tensor | None:
+        return request.scene.extra.get(EXTRA)

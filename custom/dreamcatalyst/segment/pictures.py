@@ -11,7 +11,7 @@ from .api import Mask, MaskRequest
 TINT = (1.0, 0.15, 0.1)  # of what may change
 
 
-def overlay(image: Tensor, mask: Tensor, strength: float = 0.6) -> Tensor:
+def overlay(image: Tensor, mask: Tensor, strength: float = 0.5) -> Tensor:
     """`image` [H,W,3] in [0,1], tinted red where `mask` [H,W] in [0,1] is on and darkened by a third elsewhere."""
     weight = strength * mask[..., None].to(image)
     return image.clamp(0, 1) * (1 - weight) * (2 + mask[..., None].to(image)) / 3 + weight * image.new_tensor(TINT)
