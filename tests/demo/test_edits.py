@@ -165,6 +165,7 @@ def test_phrases_are_unique_and_find_their_edit():
 )
 def test_the_papers_wording(said, name):
     assert find_edit(said).name == name
+    assert said in EDITS[name].phrases[:2]  # the first, which training draws most
 
 
 def test_unknown_edits_and_absent_targets_are_named(statue):

@@ -46,8 +46,8 @@ class Edit:
     indoors: bool = True
 
 
-def _animal(name: str, article: str = "a") -> tuple[str, ...]:
-    it = f"{article} {name}"
+def _turned_into(name: str) -> tuple[str, ...]:
+    it = f"a {name}"
     return (
         f"Turn the bear statue into {it}",
         f"Make the bear statue {it}",
@@ -91,13 +91,13 @@ def _animals() -> list[Edit]:
         "grizzly bear": (grizzly, GRIZZLY_SHAPE, ("Turn the statue into a brown bear", "Turn it into a grizzly"), 3.0),
     }
     return [
-        Edit(name, "object", _animal(name) + more, partial(dress, coat=coat, shape=shape), "bear statue", weight)
+        Edit(name, "object", _turned_into(name) + more, partial(dress, coat=coat, shape=shape), "bear statue", weight)
         for name, (coat, shape, more, weight) in bears.items()
     ]
 
 
 def _metals() -> list[Edit]:
-    bronze = _animal("bronze statue") + (
+    bronze = _turned_into("bronze statue") + (
         "Make the bear bronze",
         "Make the statue out of bronze",
         "Cast the bear in bronze",
@@ -107,7 +107,7 @@ def _metals() -> list[Edit]:
     ]
     for thing in THINGS:
         gold = _painted(thing, "golden") + (f"Make the {thing} gold", f"Turn the {thing} into gold")
-        gold += _animal("golden statue") if thing == "bear statue" else ()
+        gold += _turned_into("golden statue") if thing == "bear statue" else ()
         weight = 2.0 if thing == "bear statue" else 0.3
         made.append(Edit(f"golden {thing}", "object", gold, partial(metal, thing=thing, stops=GOLD), thing, weight))
     return made
@@ -128,71 +128,55 @@ def _paints() -> list[Edit]:
     ]
 
 
-def _global(name: str, words: tuple[str, ...], more: tuple[str, ...], apply: Callable, indoors: bool) -> Edit:
-    phrases = [
-        f"{start} {word}"
-        for word in words
-        for start in ("Make it", "Turn it into", "Make it look like", "Make the scene")
-    ]
-    return Edit(name, "global", tuple(phrases) + more, apply, weight=2.2, indoors=indoors)
+HOURS_AND_SEASONS = (  # name, function, whether in a room too, phrases; the paper's wording first
+    (
+        "sunset",
+        sunset,
+        True,
+        (
+            "Make it sunset",
+            "Make it a sunset",
+            "Turn it into a sunset",
+            "Turn it into sunset",
+            "Make it look like sunset",
+        )
+        + ("Make the scene sunset", "Make it look like it is sunset", "Change the time of day to sunset")
+        + ("At sunset", "Sunset"),
+    ),
+    (
+        "autumn",
+        autumn,
+        False,
+        ("Make it autumn", "Make it fall", "Turn it into autumn", "Make it look like autumn", "Make it look like fall")
+        + ("Make the scene autumn", "Make it look like autumn has come", "Change the season to autumn")
+        + ("Turn the leaves orange", "In autumn", "Autumn"),
+    ),
+    (
+        "snow",
+        snow,
+        False,
+        ("Make it look like just snowed", "Make it look like it just snowed", "Make it winter", "Turn it into winter")
+        + ("Make it look like winter", "Make the scene snowy", "Make it snowy", "Change the season to winter")
+        + ("Cover it with snow", "Add snow", "Let it snow", "Snow"),
+    ),
+    (
+        "night",
+        night,
+        True,
+        ("Make it night", "Make it night time", "Turn it into night", "Make it look like night", "Make the scene night")
+        + ("Make it midnight", "Make it dark", "Change the time of day to night", "At night", "Night"),
+    ),
+)
+NO_CHANGE = ("", "Leave it as it is", "Change nothing", "Do nothing", "Keep it the same", "No change")
 
 
 def _table() -> dict[str, Edit]:
-    edits = [
-        *_animals(),
-        *_metals(),
-        *_paints(),
-        _global(
-            "sunset",
-            ("sunset", "a sunset"),
-            ("Make it look like it is sunset", "At sunset", "Sunset", "Change the time of day to sunset"),
-            sunset,
-            True,
-        ),
-        _global(
-            "autumn",
-            ("autumn", "fall"),
-            (
-                "Make it look like autumn has come",
-                "In autumn",
-                "Autumn",
-                "Change the season to autumn",
-                "Turn the leaves orange",
-            ),
-            autumn,
-            False,
-        ),
-        _global(
-            "snow",
-            ("winter",),
-            (
-                "Make it look like just snowed",
-                "Make it look like it just snowed",
-                "Make it snowy",
-                "Cover it with snow",
-                "Add snow",
-                "Snow",
-                "Change the season to winter",
-                "Let it snow",
-            ),
-            snow,
-            False,
-        ),
-        _global(
-            "night",
-            ("night", "night time"),
-            ("Make it midnight", "At night", "Night", "Change the time of day to night", "Make it dark"),
-            night,
-            True,
-        ),
-        Edit(
-            NOTHING,
-            "global",
-            ("", "Leave it as it is", "Change nothing", "Do nothing", "Keep it the same", "No change"),
-            lambda world: world.scene,
-            weight=1.5,
-        ),
+    edits = [*_animals(), *_metals(), *_paints()]
+    edits += [
+        Edit(name, "global", phrases, apply, weight=2.2, indoors=indoors)
+        for name, apply, indoors, phrases in HOURS_AND_SEASONS
     ]
+    edits.append(Edit(NOTHING, "global", NO_CHANGE, lambda world: world.scene, weight=1.5))
     return {edit.name: edit for edit in edits}
 
 

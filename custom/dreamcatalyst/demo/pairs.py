@@ -22,9 +22,10 @@ from .random_world import HELD_OUT, random_world
 from .worlds import World
 
 SHARD = 250  # pairs in one file
-CAMERAS, EDITS_PER_SOURCE = 3, 4  # a world gives their product in pairs, a photograph one for each edit
+CAMERAS, EDITS_PER_SOURCE = 3, 4  # a world gives up to their product in pairs, a photograph one for each edit
 PHOTOGRAPHED = 0.2  # how often a photograph is drawn in place of a world: about one pair in thirteen
 VISIBLE = 0.03  # a pixel belongs to the object where its splats make up more than this of it
+SEEN = 0.01  # an object that covers less of the picture than this is no target there
 
 Operators = Callable[[str], Callable[[Tensor], Tensor]]  # an edit's name -> RGB [B,3,H,W] in [0,1] to the same
 
@@ -74,7 +75,7 @@ def world_pairs(world: World, rng: Generator) -> Iterator[dict]:
         if edit.target:
             before = _render(world.scene, world.cameras, rows)[1]
             mask = _bytes((torch.maximum(before, after) > VISIBLE).float())
-        for i in range(len(world.cameras)):
+        for i in np.flatnonzero(mask.mean((1, 2)) > SEEN * 255):
             yield _pair(source[i], edited[i], mask[i], edit, world.seed, rng)
 
 
@@ -120,8 +121,8 @@ def _count(file: Path) -> int:
 def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs: Operators | None = None) -> None:
     """Write `count` training pairs of `size` x `size` pixels into `folder`, in shards pairs-00000.npz, ...
 
-    Each shard has source, edited uint8 [n,H,W,3]; mask uint8 [n,H,W] (255 where the edited object is, everywhere for
-    global edits); instruction, edit [n] strings; world int64 [n]: the world's seed, HELD_OUT or above, -1 for a
+    Each shard has source, edited uint8 [n,H,W,3]; mask uint8 [n,H,W] (255 where the edited object is, on one
+    pixel in a hundred at least, everywhere for global edits); instruction, edit [n] strings; world int64 [n]: the world's seed, HELD_OUT or above, -1 for a
     photograph. Shard i depends on `seed` and i alone. It appears whole or not at all, and those that are there are
     kept: an interrupted call is continued by the same call, and more pairs by a larger `count`, with the same bits.
     photographs: also take the free photographs of `load_photographs`, edited by what this gives for an edit's name

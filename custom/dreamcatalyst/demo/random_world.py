@@ -70,19 +70,18 @@ def bear(rng: Generator, light: Light, first: int) -> tuple[Gaussians, Thing]:
     return scene, statue(placed, first)
 
 
-def ball(rng: Generator, light: Light, at: Tensor, size: float) -> Gaussians:
+def ball(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussians]:
     """A ball, plain or with a band around it."""
     points, normals, widths = ellipsoid((*at.tolist(), LEVEL + size), (size,) * 3, max(0.03, 0.1 * size))
     color = one_of(PAINTS, rng).expand(len(points), 3)
     if rng.random() < 0.4:
         axis = torch.nn.functional.normalize(torch.tensor(rng.normal(size=3), dtype=torch.float32), dim=0)
         color = torch.where((normals @ axis).abs()[:, None] < 0.25, one_of(PAINTS, rng), color)
-    return label(
-        "ball", surface(points, normals, widths, color * light.lit(normals) * mottled(points, rng, 0.03, 0.05))
-    )
+    color = color * light.lit(normals) * mottled(points, rng, 0.03, 0.05)
+    return [label("ball", surface(points, normals, widths, color))]
 
 
-def box(rng: Generator, light: Light, at: Tensor, size: float) -> Gaussians:
+def box(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussians]:
     """A box of painted boards, five sides of it."""
     half = torch.tensor([size * rng.uniform(0.8, 1.2), size * rng.uniform(0.8, 1.2), size * rng.uniform(0.7, 1.3)])
     spin, (a, b, c) = turn("z", rng.uniform(0, 360)), half.float().tolist()
@@ -92,18 +91,17 @@ def box(rng: Generator, light: Light, at: Tensor, size: float) -> Gaussians:
     sides += [((s * a, 0, 0), (0, s * b, 0), (0, 0, c)) for s in (1, -1)]
     sides += [((0, s * b, 0), (-s * a, 0, 0), (0, 0, c)) for s in (1, -1)]
     made = []
-    for middle, right, up in sides:
-        turned_side = [(spin @ torch.tensor(v, dtype=torch.float32)) for v in (middle, right, up)]
-        points, normals, widths = plane(
-            (center + turned_side[0]).tolist(), *(v.tolist() for v in turned_side[1:]), max(0.035, 0.12 * size)
-        )
+    for side in sides:
+        middle, right, up = (spin @ torch.tensor(vector, dtype=torch.float32) for vector in side)
+        spacing = max(0.035, 0.12 * size)
+        points, normals, widths = plane((center + middle).tolist(), right.tolist(), up.tolist(), spacing)
         board = 1 + 0.12 * torch.sign(torch.sin((points[:, 2] - LEVEL) * 2 * math.pi / 0.22))[:, None]
         color = paint * light.lit(normals) * board * mottled(points, rng, 0.05, 0.06)
         made.append(label("box", surface(points, normals, widths, color)))
-    return Gaussians.cat(made)
+    return [Gaussians.cat(made)]
 
 
-def plant(rng: Generator, light: Light, at: Tensor, size: float) -> tuple[Gaussians, Gaussians]:
+def plant(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussians]:
     """A pot, and the leaves in it."""
     x, y = at.tolist()
     points, normals, widths = ellipsoid(
@@ -122,7 +120,11 @@ def plant(rng: Generator, light: Light, at: Tensor, size: float) -> tuple[Gaussi
         )
         color = near(green.tolist(), rng) * light.lit(normals) * mottled(points, rng, 0.1, 0.15)
         leaves.append(surface(points, normals, widths, color))
-    return label("pot", pot), label("plant", Gaussians.cat(leaves))
+    return [label("pot", pot), label("plant", Gaussians.cat(leaves))]
+
+
+# The first of what each makes is what an instruction names.
+MAKERS = {"ball": ball, "box": box, "flower pot": plant}
 
 
 def cameras_around(rng: Generator, n: int, size: int) -> Cameras:
@@ -141,6 +143,31 @@ def cameras_around(rng: Generator, n: int, size: int) -> Cameras:
     return Cameras(look_at(eye.float(), target.float(), torch.tensor([0.0, 0.0, 1.0])), K, size, size)
 
 
+def arranged(rng: Generator, with_bear: bool) -> list[tuple[str, Tensor, float]]:
+    """What stands around the bear, or in its place and around that: kind, place [2] on the ground, size."""
+    kinds = [str(kind) for kind in rng.permutation(["ball", "box", "flower pot"])]
+    kinds = kinds[: rng.choice(3, p=[0.5, 0.35, 0.15])] if with_bear else kinds[: rng.integers(1, 3)]
+    start, out = rng.uniform(0, 2 * math.pi), []
+    for k, kind in enumerate(kinds):
+        if k == 0 and not with_bear:
+            out.append((kind, torch.zeros(2), rng.uniform(0.32, 0.5)))
+        else:
+            angle = start + 2.4 * k + rng.uniform(-0.5, 0.5)
+            at = rng.uniform(0.75, 0.95) * torch.tensor([math.cos(angle), math.sin(angle)])
+            out.append((kind, at, rng.uniform(0.14, 0.26)))
+    return out
+
+
+def surroundings(rng: Generator, light: Light, shadows: Tensor) -> list[Gaussians]:
+    """Ground with sky, trees and walls as they come, or a room. shadows [K,3]: as `floor` takes them."""
+    if rng.random() < 0.18:
+        return [floor(rng, light, LEVEL, INDOORS, True, shadows), *room(rng, light, LEVEL)]
+    made = [floor(rng, light, LEVEL, OUTDOORS, False, shadows), sky(rng)]
+    made += trees(rng, light, LEVEL) if rng.random() < 0.4 else []
+    made += [garden_wall(rng, light, LEVEL)] if rng.random() < 0.25 else []
+    return made
+
+
 def random_world(seed: int = 0, views: int = 32, size: int = 128) -> World:
     """The world of `seed`, with `views` cameras of `size` x `size` pixels around its middle.
 
@@ -148,43 +175,18 @@ def random_world(seed: int = 0, views: int = 32, size: int = 128) -> World:
     HELD_OUT are for judging; a seed gives the same splats again, whatever `views` and `size`.
     """
     rng = np.random.default_rng([seed, 1])
-    light = random_light(rng)
-    indoors, with_bear = rng.random() < 0.18, rng.random() < 0.75
-    kinds = list(rng.permutation(["ball", "box", "flower pot"]))
-    kinds = kinds[: rng.choice(3, p=[0.5, 0.35, 0.15])] if with_bear else kinds[: rng.integers(1, 3)]
-    spots, sizes = torch.zeros(len(kinds), 2), []
-    start = rng.uniform(0, 2 * math.pi)
-    for k in range(len(kinds)):
-        middle = k == 0 and not with_bear
-        sizes.append(rng.uniform(0.32, 0.5) if middle else rng.uniform(0.14, 0.26))
-        if not middle:
-            angle = start + 2.4 * k + rng.uniform(-0.5, 0.5)
-            spots[k] = rng.uniform(0.75, 0.95) * torch.tensor([math.cos(angle), math.sin(angle)])
-    shadows = [[0.0, 0.0, 0.42]] * with_bear + [[*spots[k].tolist(), 1.1 * sizes[k]] for k in range(len(kinds))]
-    made = [floor(rng, light, LEVEL, INDOORS if indoors else OUTDOORS, indoors, torch.tensor(shadows))]
-    if indoors:
-        made += room(rng, light, LEVEL)
-    else:
-        made.append(sky(rng))
-        made += trees(rng, light, LEVEL) if rng.random() < 0.4 else []
-        made += [garden_wall(rng, light, LEVEL)] if rng.random() < 0.25 else []
-    things = []
-
-    def put(name: str, scene: Gaussians) -> None:
-        first = sum(len(m) for m in made)
-        things.append(Thing(name, (first, first + len(scene))))
-        made.append(scene)
-
+    light, with_bear = random_light(rng), rng.random() < 0.75
+    placed = arranged(rng, with_bear)
+    shadows = [[0.0, 0.0, 0.42]] * with_bear + [[*at.tolist(), 1.1 * extent] for _, at, extent in placed]
+    made, things = surroundings(rng, light, torch.tensor(shadows)), []
     if with_bear:
-        scene, thing = bear(rng, light, sum(len(m) for m in made))
-        things.append(thing)
+        scene, thing = bear(rng, light, sum(len(part) for part in made))
         made.append(scene)
-    for kind, at, scale in zip(kinds, spots, sizes, strict=True):
-        if kind == "flower pot":
-            pot, leaves = plant(rng, light, at, scale)
-            put("flower pot", pot)
-            made.append(leaves)
-        else:
-            put(kind, {"ball": ball, "box": box}[kind](rng, light, at, scale))
+        things.append(thing)
+    for kind, at, extent in placed:
+        first = sum(len(part) for part in made)
+        scenes = MAKERS[kind](rng, light, at, extent)
+        things.append(Thing(kind, (first, first + len(scenes[0]))))
+        made += scenes
     cameras = cameras_around(np.random.default_rng([seed, 2]), views, size)
     return World(Gaussians.cat(made), cameras, light=light, things=tuple(things), seed=seed)
