@@ -121,10 +121,11 @@ def _count(file: Path) -> int:
 def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs: Operators | None = None) -> None:
     """Write `count` training pairs of `size` x `size` pixels into `folder`, in shards pairs-00000.npz, ...
 
-    Each shard has source, edited uint8 [n,H,W,3]; mask uint8 [n,H,W] (255 where the edited object is, on one
-    pixel in a hundred at least, everywhere for global edits); instruction, edit [n] strings; world int64 [n]: the world's seed, HELD_OUT or above, -1 for a
-    photograph. Shard i depends on `seed` and i alone. It appears whole or not at all, and those that are there are
-    kept: an interrupted call is continued by the same call, and more pairs by a larger `count`, with the same bits.
+    Each shard has source, edited uint8 [n,H,W,3]; mask uint8 [n,H,W] (255 where the edited object is, at least on SEEN
+    of the picture; everywhere for global edits); instruction, edit [n] strings; world int64 [n]: the world's seed,
+    HELD_OUT or above, -1 for a photograph. Shard i depends on `seed` and i alone. It appears whole or not at all, and
+    those that are there are kept: an interrupted call is continued by the same call, and more pairs are made by a
+    larger `count`, with the same bits.
     photographs: also take the free photographs of `load_photographs`, edited by what this gives for an edit's name
     (sunset, autumn, snow, night).
     Raises DataError where the folder holds pairs of other settings, ConfigError where photographs are not installed.
