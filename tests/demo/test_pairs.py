@@ -80,6 +80,12 @@ def test_pairs_of_other_settings_are_not_mixed(folder, tmp_path):
         read_pairs(tmp_path)
 
 
+def test_what_is_complete_needs_no_photographs(folder, made, monkeypatch):
+    monkeypatch.setattr(photographs, "PHOTOGRAPHS", (("no_such_package", "no-such-package", {}),))
+    make_pairs(folder, COUNT, seed=3, size=SIZE, photographs=lambda name: lambda x: x)
+    same(read_pairs(folder), made)
+
+
 def test_photographs_are_edited_as_wholes():
     image = np.random.default_rng(0).integers(0, 256, (60, 90, 3), dtype=np.uint8)
     made = list(photograph_pairs([image], lambda name: lambda x: 1 - x, 24, np.random.default_rng(1)))

@@ -106,7 +106,7 @@ def _settings(folder: Path, settings: dict) -> None:
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(settings), encoding="utf-8")
-    elif (there := json.loads(file.read_text(encoding="utf-8"))) != settings:
+    elif (there := json.loads(file.read_text(encoding="utf-8"))) | settings != there:
         raise DataError(f"{folder}: holds pairs made with {there}, asked for are {settings}. Choose another folder")
 
 
@@ -127,20 +127,21 @@ def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs
     those that are there are kept: an interrupted call is continued by the same call, and more pairs are made by a
     larger `count`, with the same bits.
     photographs: also take the free photographs of `load_photographs`, edited by what this gives for an edit's name
-    (sunset, autumn, snow, night).
+    (sunset, autumn, snow, night), such as the closed form's operators. Not asked for where no pair is missing.
     Raises DataError where the folder holds pairs of other settings, ConfigError where photographs are not installed.
     """
-    folder, images = Path(folder), load_photographs() if photographs else []
-    _settings(folder, dict(seed=seed, size=size, shard=SHARD, photographs=len(images)))
-    for i in range(-(-count // SHARD)):
-        wanted, file = min(SHARD, count - i * SHARD), folder / f"pairs-{i:05d}.npz"
-        if _count(file) >= wanted:
-            continue
-        pairs = [pair for _, pair in zip(range(wanted), shard_pairs(seed, i, size, images, photographs), strict=False)]
-        part = file.with_suffix(".part")
-        with part.open("wb") as stream:
-            np.savez(stream, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
-        part.replace(file)
+    folder, wanted = Path(folder), {i: min(SHARD, count - i * SHARD) for i in range(-(-count // SHARD))}
+    files = {i: folder / f"pairs-{i:05d}.npz" for i in wanted}
+    missing = [i for i in wanted if _count(files[i]) < wanted[i]]
+    images = load_photographs() if photographs and missing else []
+    _settings(folder, dict(seed=seed, size=size, shard=SHARD) | (dict(photographs=len(images)) if missing else {}))
+    for i in missing:
+        stream = shard_pairs(seed, i, size, images, photographs)
+        pairs = [pair for _, pair in zip(range(wanted[i]), stream, strict=False)]
+        part = files[i].with_suffix(".part")
+        with part.open("wb") as out:
+            np.savez(out, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
+        part.replace(files[i])
 
 
 def read_pairs(folder: Path) -> dict[str, ndarray]:
