@@ -11,6 +11,8 @@ OFFERS = {
     "dreamcatalyst-data": ".train.datamodule",
     "dreamcatalyst-fit-system": ".train.fit",
     "dreamcatalyst-edit-system": ".train.edit",
+    "dreamcatalyst-prior-data": ".train.prior.data",
+    "dreamcatalyst-prior-system": ".train.prior.system",
     "dreamcatalyst-guidance": ".guidance.host",
     "dreamcatalyst-edit-guidance": ".guidance.host",
 }

@@ -1,0 +1,342 @@
+"""Training a small InstructPix2Pix: first the autoencoder on crops, then text encoder and U-Net on its latents."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ... import plugin
+from ...config import parse
+from ...diffusion.ip2p import InstructPix2Pix, Ip2pConfig
+from ...diffusion.noise import keyed_generator, stable_diffusion_schedule
+from ...errors import ConfigError, DataError, NumericalError
+from ...report.pictures import write_png
+from .data import PriorData
+from .folder import write_prior
+from .judge import SamplesConfig, edit_rows, judge_pairs, reconstruction_rows, score_table, sheet
+from .latents import cached_latents
+from .losses import min_snr_weights, noised, reconstruction_loss
+from .models import TIMESTEPS, AutoencoderConfig, Stage, TextConfig, UnetConfig, make_networks
+from .vocabulary import learn_merges, vocabulary, write_tokenizer
+
+STAGES = {"autoencoder": ("vae",), "unet": ("unet", "text_encoder")}  # what trains in each, in order
+CLIP = 1.0  # largest norm of a gradient
+
+
+@dataclass
+class Progress:
+    """How far a stage is. first: the run's step at which it began, None before; seconds: spent in its steps."""
+
+    first: int | None = None
+    seconds: float = 0.0
+
+    def at(self, step: int, stage: Stage) -> float:
+        """From 0 to 1 over the stage, by its steps, or by its minutes where these are over sooner."""
+        if self.first is None:
+            return 0.0
+        by_time = self.seconds / 60 / stage.minutes if stage.minutes else 0.0
+        return min(max((step - self.first) / stage.steps, by_time), 1.0)
+
+    def steps(self, step: int, end: int | None) -> int:
+        """How many steps were done by the run's `step`, where the stage was over at `end` (None: it is not)."""
+        return 0 if self.first is None else (step if end is None else end) - self.first
+
+
+@plugin.register("dreamcatalyst-prior-system")
+class PriorSystem(plugin.BaseSystem):
+    """Trains in two stages; `ema` holds the weights that are kept, and is what is sampled, encoded with and written.
+
+    What a step draws is a function of the seed and its number, so that a resumed run has the bits of an uninterrupted
+    one (unless a stage is ended by minutes).
+    """
+
+    parts: dict[str, type] = {
+        "autoencoder": AutoencoderConfig,
+        "text": TextConfig,
+        "unet": UnetConfig,
+        "samples": SamplesConfig,
+    }
+
+    @dataclass
+    class Config(plugin.BaseSystem.Config):
+        seed: int = 0
+        autoencoder: dict = field(default_factory=dict)
+        text: dict = field(default_factory=dict)
+        unet: dict = field(default_factory=dict)
+        samples: dict = field(default_factory=dict)
+        origin: str = "Made by `custom/dreamcatalyst/demo`."  # where the pairs come from, for the model card
+
+    # --- setting up
+
+    def configure(self) -> None:
+        self.automatic_optimization = False
+        self.part = {name: parse(cls, getattr(self.cfg, name), f"system.{name}") for name, cls in self.parts.items()}
+        self.progress = {name: Progress() for name in STAGES}
+        self.networks: nn.ModuleDict | None = None
+        self.latents: dict[str, Tensor] | None = None
+        self._loss: float | None = None  # smoothed
+        self._outcomes: list[dict[str, Any]] = []
+
+    def setup(self, stage: str) -> None:
+        if self.networks is not None:
+            return
+        data = self.data
+        self.merges = learn_merges(data.pairs.instruction)
+        self.tokens = len(vocabulary(self.merges))
+        make = self.part
+        self.networks = make_networks(
+            make["autoencoder"], make["text"], make["unet"], data.cfg.size, self.tokens, self.cfg.seed
+        )
+        self.ema = copy.deepcopy(self.networks).requires_grad_(False)
+        self.register_buffer("latent_std", torch.ones(()))
+        for network in (self.networks, self.ema):
+            network.to(memory_format=torch.channels_last)
+        self.abar = stable_diffusion_schedule(TIMESTEPS).float()
+
+    @property
+    def data(self) -> PriorData:
+        return self.trainer.datamodule
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        return [
+            torch.optim.AdamW(
+                [p for name in names for p in self.networks[name].parameters()],
+                lr=self.part[stage].learning_rate,
+                betas=(0.9, 0.99),
+                weight_decay=0.01,
+            )
+            for stage, names in STAGES.items()
+        ]
+
+    # --- training
+
+    @property
+    def stage(self) -> str:
+        return "autoencoder" if self.progress["unet"].first is None else "unet"
+
+    def on_train_start(self) -> None:
+        if self.progress["autoencoder"].first is None:
+            self.progress["autoencoder"].first = self.true_global_step
+        if self.stage == "unet":
+            self._load_latents()
+
+    def training_step(self, batch: Mapping[str, int], batch_idx: int) -> None:
+        started = time.perf_counter()
+        stage, step = self.stage, batch["step"]
+        config, progress = self.part[stage], self.progress[stage]
+        done = progress.at(step, config)
+        number = step - progress.first
+        optimizer = self.optimizers()[list(STAGES).index(stage)]
+        rate = config.learning_rate * min(1.0, (number + 1) / max(config.warm_up, 1)) * _cosine(done)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        loss = self._autoencoder_loss(number, done) if stage == "autoencoder" else self._unet_loss(number)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise NumericalError(f"step {step}, stage {stage}: the loss is {value}. Lower its learning_rate.")
+        optimizer.zero_grad()
+        self.manual_backward(loss)
+        parameters = [p for name in STAGES[stage] for p in self.networks[name].parameters()]
+        nn.utils.clip_grad_norm_(parameters, CLIP)
+        optimizer.step()
+        kept = [p for name in STAGES[stage] for p in self.ema[name].parameters()]
+        with torch.no_grad():
+            torch._foreach_lerp_(kept, parameters, 1 - min(config.ema, (number + 1) / (number + 10)))
+        self.log("loss", value)
+        self._loss = value if self._loss is None else 0.98 * self._loss + 0.02 * value
+        progress.seconds += time.perf_counter() - started
+
+    def _autoencoder_loss(self, number: int, done: float) -> Tensor:
+        config: AutoencoderConfig = self.part["autoencoder"]
+        side, size = config.crop, config.batch_size
+        if done >= 1 - config.whole:
+            side, size = self.data.cfg.size, max(1, round(size * (config.crop / self.data.cfg.size) ** 2))
+        images = self.data.crops(number, size, side).to(self.device, memory_format=torch.channels_last) * 2 - 1
+        posterior = self.networks["vae"].encode(images).latent_dist
+        noise = torch.randn(posterior.mean.shape, generator=keyed_generator(self.cfg.seed, "posterior", number))
+        made = self.networks["vae"].decode(posterior.mean + posterior.std * noise.to(images)).sample
+        divergence = 0.5 * (posterior.mean**2 + posterior.var - 1 - posterior.logvar).mean()
+        return reconstruction_loss(made, images, config.gradients) + config.kl * divergence
+
+    def _unet_loss(self, number: int) -> Tensor:
+        config: UnetConfig = self.part["unet"]
+        index = self.data.batch(number, config.batch_size)
+        clean, image, texts, noise, t = self._unet_inputs(index, number)
+        abar = self.abar.to(self.device)[t]
+        noisy, v = noised(clean, noise, abar)
+        inputs = torch.cat([noisy, image], 1).to(memory_format=torch.channels_last)
+        predicted = self.networks["unet"](inputs, t, encoder_hidden_states=self._embed(texts), return_dict=False)[0]
+        error = F.mse_loss(predicted.float(), v, reduction="none").mean((1, 2, 3))
+        return (min_snr_weights(abar, config.min_snr) * error).mean()
+
+    def _unet_inputs(self, index: np.ndarray, number: int) -> tuple[Tensor, Tensor, list[str], Tensor, Tensor]:
+        """Clean scaled latents, image latents, instructions, noise and timesteps of one step.
+
+        Conditions are dropped as in Brooks et al. 2023, but for one thing: without an instruction and with the image,
+        the aim is the image itself. The null instruction then changes nothing, and guidance points from there.
+        """
+        config: UnetConfig = self.part["unet"]
+        rng = np.random.default_rng((self.cfg.seed, number, 1))
+        draw, t = rng.random(len(index)), torch.from_numpy(rng.integers(0, TIMESTEPS, len(index)))
+        text_end, image_end = config.drop_text, config.drop_text + config.drop_image
+        no_text = draw < text_end
+        no_image = (text_end <= draw) & (draw < image_end)
+        neither = (image_end <= draw) & (draw < image_end + config.drop_both)
+        source, edited = (self.latents[kind][index].float() for kind in ("source", "edited"))
+        clean = torch.where(_column(no_text), source, edited)
+        image = source * _column(~(no_image | neither))
+        given = self.data.pairs.instruction[index]
+        texts = ["" if gone else str(text) for text, gone in zip(given, no_text | neither, strict=True)]
+        noise = torch.randn(clean.shape, generator=keyed_generator(self.cfg.seed, "noise", number))
+        clean, image, noise, t = (x.to(self.device) for x in (clean, image, noise, t))
+        return clean / self.latent_std, image, texts, noise, t
+
+    def _embed(self, texts: Sequence[str]) -> Tensor:
+        """Text embeddings [B,L,D] with a graph; an instruction that comes more than once is encoded once."""
+        distinct = list(dict.fromkeys(texts))
+        ids = torch.stack([self._ids(text) for text in distinct]).to(self.device)
+        places = torch.tensor([distinct.index(text) for text in texts], device=self.device)
+        return self.networks["text_encoder"](ids)[0][places]
+
+    def _ids(self, text: str) -> Tensor:
+        """Token numbers [L] of one instruction, by the tokenizer that is written with the model."""
+        if not hasattr(self, "_tokenizer"):
+            self._known, self._tokenizer = {}, self._make_tokenizer()
+        if text not in self._known:
+            options = dict(padding="max_length", max_length=self.part["text"].tokens, truncation=True)
+            self._known[text] = self._tokenizer(text, return_tensors="pt", **options).input_ids[0]
+        return self._known[text]
+
+    def _make_tokenizer(self) -> Any:
+        from transformers import CLIPTokenizer
+
+        folder = write_tokenizer(self.path("prior") / "tokenizer", self.merges, self.part["text"].tokens)
+        return CLIPTokenizer.from_pretrained(folder)
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        super().on_train_batch_end(outputs, batch, batch_idx)
+        step, stage, every = self.true_global_step, self.stage, self.part["samples"].every
+        over = self.progress[stage].at(step, self.part[stage]) >= 1
+        if over or (every and step % every == 0):
+            self.write_pictures(step)
+        if over and stage == "autoencoder":
+            self._begin_unet(step)
+        elif over:
+            self.trainer.should_stop = True
+
+    def _begin_unet(self, step: int) -> None:
+        """Encode all pairs with the finished autoencoder."""
+        self.progress["unet"].first, self._loss = step, None
+        self._load_latents()
+        self.latent_std.copy_(self.latents["edited"].float().std())
+        plugin.info(f"autoencoder done at step {step}; standard deviation of its latents {float(self.latent_std):.4f}")
+
+    def _load_latents(self) -> None:
+        self.ema["vae"].to(self.device)
+        self.latents = cached_latents(self.path("latents.pt"), self.ema["vae"], self.data.pairs, self.device)
+
+    def progress_metrics(self) -> dict[str, Any]:
+        stage = self.stage
+        share = self.progress[stage].at(self.true_global_step, self.part[stage])
+        shown = {"stage": stage, "of it": f"{share:.0%}", "minutes": self.progress[stage].seconds / 60}
+        return shown if self._loss is None else {**shown, "loss": self._loss}
+
+    def on_train_end(self) -> None:
+        self.write_folder()
+        if self.progress["unet"].at(self.true_global_step, self.part["unet"]) < 1:
+            self.save_now()  # ended by something else, such as trainer.max_time
+
+    # --- looking
+
+    def write_pictures(self, step: int) -> None:
+        """Some held-out pairs: what the autoencoder makes of them or, in the second stage, the edits of the moment."""
+        index = self.data.held_out_spread(self.part["samples"].pictures)
+        if self.stage == "autoencoder":
+            rows, decibel = reconstruction_rows(self.ema["vae"], self.data.pairs, index, self.device)
+        else:
+            judged = self._judge(self.prior(), index)
+            rows, decibel = edit_rows(judged), float(judged["edit_inside"].nanmean())
+        write_png(self.path(f"it{step}-{self.stage}.png"), sheet(rows))
+        plugin.info(f"step {step}, {self.stage}: {decibel:.2f} dB on held-out pairs")
+
+    def _judge(self, prior: InstructPix2Pix, index: Sequence[int]) -> dict[str, Any]:
+        return judge_pairs(prior, self.data.pairs, index, self.part["samples"], self.cfg.seed)
+
+    def on_test_start(self) -> None:
+        self._prior = self.prior()
+
+    def test_step(self, batch: Mapping[str, list[int]], batch_idx: int) -> None:
+        self._outcomes.append(self._judge(self._prior, batch["index"]))
+
+    def on_test_epoch_end(self) -> None:
+        print(f"held-out pairs, PSNR in dB:\n{score_table(self._outcomes)}", flush=True)
+        rows = [row for judged in self._outcomes for row in edit_rows(judged)]
+        write_png(self.path(f"it{self.true_global_step}-test.png"), sheet(rows))
+        plugin.info(f"the model: {self.path('prior')}")
+        self._outcomes = []
+
+    on_validation_start, validation_step, on_validation_epoch_end = on_test_start, test_step, on_test_epoch_end
+
+    def predict_step(self, batch: Mapping[str, list[int]], batch_idx: int) -> None:
+        """Export needs no pair."""
+
+    def on_predict_epoch_end(self) -> None:
+        plugin.info(f"exported to {self.write_folder()}")
+
+    # --- files and checkpoints
+
+    def path(self, name: str) -> Path:
+        """A file under the run's save folder."""
+        return Path(self.get_save_path(name))
+
+    def prior(self) -> InstructPix2Pix:
+        """The kept weights, written and loaded again as any user of them would."""
+        return InstructPix2Pix(Ip2pConfig(path=str(self.write_folder())), self.device)
+
+    def write_folder(self) -> Path:
+        """Write the model of the moment under the run's save folder."""
+        pairs = self.data.pairs
+        wordings: dict[str, list[str]] = {}
+        for edit, text in sorted(set(zip(pairs.edit.tolist(), pairs.instruction.tolist(), strict=True))):
+            wordings.setdefault(edit, []).append(text)
+        card = {"pairs": len(self.data.train), "origin": self.cfg.origin}
+        card |= {name: self.progress[name].steps(self.true_global_step, after) for name, after in self._ends()}
+        return write_prior(self.path("prior"), self.ema, self.merges, float(self.latent_std), wordings, card)
+
+    def _ends(self) -> list[tuple[str, int | None]]:
+        return [("autoencoder", self.progress["unet"].first), ("unet", None)]
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        progress = {name: asdict(progress) for name, progress in self.progress.items()}
+        checkpoint["prior"] = {"progress": progress, "merges": self.merges, "loss": self._loss}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        if "prior" not in checkpoint:
+            raise ConfigError("resume: the checkpoint is of another kind of run, expected one of configs/prior.yaml.")
+        kept = checkpoint["prior"]
+        if kept["merges"] != self.merges:
+            raise DataError(
+                f"resume: {self.data.folder} has other instructions than those of the checkpoint, whose words are the "
+                f"text encoder's tokens. Name the pairs that it was trained on: data.pairs=..."
+            )
+        self.progress = {name: Progress(**progress) for name, progress in kept["progress"].items()}
+        self._loss = kept["loss"]
+
+
+def _column(values: np.ndarray) -> Tensor:
+    """[B] as [B,1,1,1]."""
+    return torch.from_numpy(values)[:, None, None, None]
+
+
+def _cosine(done: float) -> float:
+    return 0.5 * (1 + math.cos(math.pi * done))
