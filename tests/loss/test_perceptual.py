@@ -3,7 +3,7 @@
 import pytest
 import torch
 from dreamcatalyst.errors import ConfigError
-from dreamcatalyst.loss.perceptual import BLOCKS, Lpips, standardised
+from dreamcatalyst.loss.perceptual import BLOCKS, WEIGHT_BYTES, Lpips, standardised
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +27,10 @@ def folder(tmp_path_factory):
 def test_layer_numbers_are_those_of_torchvision(folder):
     names = {int(n.split(".")[1]) for n in torch.load(folder / "vgg16-397923af.pth")}
     assert sorted(names) == [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
+
+
+def test_bytes_of_the_weights():
+    assert WEIGHT_BYTES == 4 * 14_714_688  # VGG-16's convolutions
 
 
 def test_a_distance(folder):

@@ -1,5 +1,6 @@
 """The plan of an edit, held against what the run really built and did."""
 
+import json
 from collections.abc import Callable
 
 import pytest
@@ -22,7 +23,7 @@ def run(launch, monkeypatch) -> Callable[..., tuple[edit.EditSystem, Plan, dict]
 
     def go(*options: str):
         seen: dict = {"rows": 0, "pixels": 0}
-        real = edit.edit_plan
+        real = edit.EditSystem.plan
 
         def spy(system):
             seen["system"], seen["plan"] = system, real(system)
@@ -42,7 +43,7 @@ def run(launch, monkeypatch) -> Callable[..., tuple[edit.EditSystem, Plan, dict]
             monkeypatch.setattr(system, "draw_now", drawn)
             return seen["plan"]
 
-        monkeypatch.setattr(edit, "edit_plan", spy)
+        monkeypatch.setattr(edit.EditSystem, "plan", spy)
         launch("closed-form.yaml", "trainer.max_steps=1", "system.report.every=0", *options)
         return seen["system"], seen["plan"], seen
 
@@ -82,9 +83,17 @@ def test_memory_is_that_of_the_tensors(run, options):
     assert size(plan, "editable splats") == tensor_size(*values, *moments, *state)
     assert size(plan, "source") == scene_bytes(system.source)
     if splats.frozen is not None:
-        assert size(plan, "frozen splats") == scene_bytes(splats.frozen) + system.frozen.limit
+        assert size(plan, "frozen splats") == scene_bytes(splats.frozen)
+        assert 0 < system.frozen.held <= size(plan, "renders of frozen splats")
     if anchors:
         assert size(plan, "anchors") == tensor_size(*anchors)
+
+
+def test_a_fit_has_a_plan_without_a_prior(launch):
+    trial = launch("fit.yaml", "trainer.max_steps=1")
+    plan = json.loads((trial / "report" / "plan.json").read_text())
+    assert {"editable splats", "view-dependent colour"} <= {part["name"] for part in plan["builds"]}
+    assert plan["network_rows"] == 0 and not {"prior", "anchors"} & {part["name"] for part in plan["builds"]}
 
 
 def test_what_is_left_out_is_not_there(run):

@@ -16,6 +16,7 @@ from torch import Tensor
 from ..errors import ConfigError
 
 BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))  # output channels, Simonyan 2015
+WEIGHT_BYTES = 4 * sum(9 * i * o + o for i, o in zip((3, *sum(BLOCKS, ())), sum(BLOCKS, ()), strict=False))
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # ImageNet's mean and deviation on [-1,1]
 SMALLEST = 16  # pixels a side: four poolings
 VGG_FILES = ("vgg16*.pth", "vgg16*.pt", "vgg16*.safetensors")

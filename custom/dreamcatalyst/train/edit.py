@@ -25,7 +25,7 @@ from ..scene.gaussians import Gaussians
 from ..scene.ply import read_ply, write_ply
 from ..segment.api import MaskConfig
 from .confine import confine, seen_mask
-from .plan import edit_plan
+from .plan import Draft, describe_edit
 from .preview import PreviewConfig, preview_sheet
 from .system import SplatSystem
 
@@ -106,11 +106,8 @@ class EditSystem(SplatSystem):
             write_ply(self.save_path("source.ply"), self.source.to("cpu"))
             self.compare_with_photos()
 
-    def on_train_start(self) -> None:
-        plan = edit_plan(self)
-        plan.write(self.report_dir / "plan.json")
-        plugin.info(plan.text())
-        super().on_train_start()
+    def describe(self, draft: Draft) -> None:
+        describe_edit(self, draft)
 
     def prepare(self) -> None:
         """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""

@@ -1,4 +1,4 @@
-"""What an edit is about to build, what it leaves out and why, and what it will cost: said before it starts.
+"""What a run is about to build, what it leaves out and why, and what it will cost: said before it starts.
 
 Derived from the configuration and the scene, not from what was built: tests hold the two against each other.
 """
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from ..cache import tensor_bytes
 from ..guidance.distill import network_rows
+from ..loss.perceptual import WEIGHT_BYTES
 from ..scene.gaussians import PARAMETERS, Gaussians
 from ..scene.generations import GENERATION
 from ..segment.api import SEGMENTERS
@@ -19,8 +20,8 @@ from .densify import STATISTICS
 
 if TYPE_CHECKING:
     from .edit import EditSystem
+    from .system import SplatSystem
 
-PERCEPTUAL_BYTES = 4 * 14_715_000  # VGG-16's convolutions in float32
 UNITS = ("B", "KiB", "MiB", "GiB")
 
 
@@ -55,10 +56,12 @@ class Plan:
         size = [readable(part.bytes) if part.bytes else "" for part in self.builds]
         lines = [f"  + {p.name}: {p.note}{f' ({s})' if s else ''}" for p, s in zip(self.builds, size, strict=True)]
         lines += [f"  - {p.name}: {p.note}" for p in self.leaves_out]
-        rows = f"{self.network_rows} rows of the prior"
+        costs = [f"{self.pixels:,} pixels"]
+        if self.network_rows:
+            costs.append(f"{self.network_rows} rows of the prior")
         if self.picture_rows:
-            rows += f" ({self.picture_rows} for each picture that is edited)"
-        return "\n".join(["plan", *lines, f"  per step: {rows}, {self.pixels:,} pixels; kept: {readable(self.bytes)}"])
+            costs.append(f"{self.picture_rows} rows of the prior for each picture that is edited")
+        return "\n".join(["plan", *lines, f"  each step: {', '.join(costs)}; kept: {readable(self.bytes)}"])
 
     def write(self, path: Path) -> Path:
         """As JSON."""
@@ -75,40 +78,73 @@ def readable(size: float) -> str:
     return f"{size:.3g} {UNITS[unit]}"
 
 
-def edit_plan(system: EditSystem) -> Plan:
-    """The plan of an edit whose prior is loaded, whose scene is read and whose mask is known."""
-    built: list[Part] = []
-    left: list[Part] = []
+class Draft:
+    """A plan in the making: what every run has, to which a system adds its own (`SplatSystem.describe`)."""
 
-    def decide(wanted: bool, name: str, note: str, why_not: str, size: int = 0) -> None:
-        (built if wanted else left).append(Part(name, note if wanted else why_not, size if wanted else 0))
+    def __init__(self, system: SplatSystem):
+        self.system = system
+        self.builds: list[Part] = []
+        self.leaves_out: list[Part] = []
+        self.network_rows = self.picture_rows = 0
 
-    capture, guidance = system.capture, system.guidance
-    rule, prior, degree = guidance.rule, guidance.prior, system.source.sh_degree
-    built.append(Part("prior", f"{guidance.config.prior_type}, rule {rule.name}", prior.weight_bytes))
-    built.append(Part("source", f"{len(system.source):,} splats before the edit", scene_bytes(system.source)))
-    _decide_splats(system, decide)
-    decide(degree > 0, "view-dependent colour", f"spherical harmonics of degree {degree}", "the scene has degree 0")
-    decide(False, "depth", "", "no output asks for it")
-    _decide_anchors(system, decide)
-    config = system.part["mask"]
-    decide(config.kind != "none", f"mask ({config.kind})", "says which splats may change", "mask.kind is none")
-    others = [kind for kind in SEGMENTERS.names() if kind != config.kind]
-    decide(False, f"other kinds of mask ({', '.join(others)})", "", "not asked for")
-    perceptual = system.part["loss"].lambda_perceptual > 0
-    decide(perceptual, "perceptual network", "LPIPS with VGG-16", "loss.lambda_perceptual is 0", PERCEPTUAL_BYTES)
-    densify = system.part["densify"]
-    active = bool(densify.every) and densify.start < min(densify.stop, system.max_steps + 1)
-    decide(active, "densification", f"every {densify.every} steps, up to {densify.max_splats:,} splats",
-           "densify.every is 0" if not densify.every else "it would start after the end of the run")  # fmt: skip
-    rows, batch = (
-        network_rows(prior, rule, guidance.text, guidance.source_text, *guidance.scales),
-        system.data.cfg.batch_size,
-    )
-    each = rows * batch * (2 if guidance.config.noise == "paired" else 1) if rule.delivers == "gradient" else 0
-    edits = rows * guidance.config.diffusion_steps if rule.delivers == "edit" else 0
-    camera = capture.cameras([capture.train[0]])
-    return Plan(tuple(built), tuple(left), each, edits, batch * camera.width * camera.height)
+    def add(self, name: str, note: str, size: int = 0) -> None:
+        """Something that is built."""
+        self.builds.append(Part(name, note, size))
+
+    def leave_out(self, name: str, why: str) -> None:
+        """Something that is not."""
+        self.leaves_out.append(Part(name, why))
+
+    def finish(self) -> Plan:
+        """The plan, with what all runs have: splats, colour, densification, depth."""
+        system = self.system
+        batch, (width, height) = system.data.cfg.batch_size, view_size(system)
+        self._splats(width * height)
+        degree = system.splats.edited.sh_degree
+        if degree:
+            self.add("view-dependent colour", f"spherical harmonics of degree {degree}")
+        else:
+            self.leave_out("view-dependent colour", "the scene has degree 0")
+        densify = system.part["densify"]
+        if not densify.every:
+            self.leave_out("densification", "densify.every is 0")
+        elif densify.start >= min(densify.stop, system.max_steps + 1):
+            self.leave_out("densification", "it would start after the end of the run, or after densify.stop")
+        else:
+            self.add("densification", f"every {densify.every} steps, up to {densify.max_splats:,} splats")
+        self.leave_out("depth", "no output asks for it")
+        pixels = batch * width * height
+        return Plan(tuple(self.builds), tuple(self.leaves_out), self.network_rows, self.picture_rows, pixels)
+
+    def _splats(self, pixels: int) -> None:
+        """Parameters with gradients and two moments for editable splats, plain tensors for the others."""
+        splats, counted = self.system.splats, {*STATISTICS, GENERATION}
+        if self.system.generations is not None:
+            counted |= {*self.system.generations.states}
+        own = tensor_bytes(dict(splats.edited.detach().parameters()))
+        state = tensor_bytes({name: value for name, value in splats.state.items() if name not in counted})
+        statistics = 4 * len(STATISTICS) * len(splats)
+        note = f"{len(splats):,} of {splats.total:,} with parameters, gradients and Adam's two moments"
+        self.add("editable splats", note, 4 * own + state + statistics)
+        if splats.frozen is None:
+            self.leave_out("frozen splats", "no mask: all splats are editable")
+            return
+        self.add("frozen splats", "never change: no gradient, no moment, no anchor", scene_bytes(splats.frozen))
+        views = len(self.system.capture.views)
+        most = min(self.system.part["renderer"].cache_mib * 2**20, views * view_bytes(len(splats.frozen), pixels))
+        self.add("renders of frozen splats", "kept on the CPU, at most", most)
+
+
+def view_bytes(frozen: int, pixels: int) -> int:
+    """What the CPU backend keeps of frozen splats in one view at most, about: an image, and a line and a few places in
+    tile lists for each splat."""
+    return 16 * pixels + 100 * frozen
+
+
+def view_size(system: SplatSystem) -> tuple[int, int]:
+    """Width and height of the renders, pixels."""
+    camera = system.capture.cameras([system.capture.train[0]])
+    return camera.width, camera.height
 
 
 def scene_bytes(scene: Gaussians) -> int:
@@ -116,32 +152,38 @@ def scene_bytes(scene: Gaussians) -> int:
     return tensor_bytes([dict(scene.parameters()), scene.extra])
 
 
-def _decide_splats(system: EditSystem, decide) -> None:
-    """Parameters with gradients and two moments for editable splats, plain tensors for the others."""
-    splats = system.splats
-    own = tensor_bytes(dict(splats.edited.detach().parameters()))
-    note = f"{len(splats):,} of {splats.total:,} with parameters, gradients and Adam's two moments"
-    per_row = {n: v for n, v in splats.state.items() if n not in system_states(system)}
-    statistics = 4 * len(STATISTICS) * len(splats)
-    decide(True, "editable splats", note, "", 4 * own + tensor_bytes(per_row) + statistics)
-    cache = system.part["renderer"].cache_mib * 2**20
-    frozen = splats.frozen
-    decide(frozen is not None, "frozen splats", "never change: no gradient, no moment, no anchor; renders of them kept",
-           "no mask: all splats are editable", 0 if frozen is None else scene_bytes(frozen) + cache)  # fmt: skip
+def describe_edit(system: EditSystem, draft: Draft) -> None:
+    """What an edit builds beyond splats: prior, source, mask, anchors, losses."""
+    guidance = system.guidance
+    rule, prior = guidance.rule, guidance.prior
+    draft.add("prior", f"{guidance.config.prior_type}, rule {rule.name}", prior.weight_bytes)
+    draft.add("source", f"{len(system.source):,} splats before the edit", scene_bytes(system.source))
+    rows = network_rows(prior, rule, guidance.text, guidance.source_text, *guidance.scales)
+    if rule.delivers == "gradient":
+        draft.network_rows = rows * system.data.cfg.batch_size * (2 if guidance.config.noise == "paired" else 1)
+    elif rule.delivers == "edit":
+        draft.picture_rows = rows * guidance.config.diffusion_steps
+    kind = system.part["mask"].kind
+    others = [name for name in SEGMENTERS.names() if name != kind]
+    if kind != "none":
+        draft.add(f"mask ({kind})", "says which splats may change")
+    draft.leave_out(f"masks by {', '.join(others)}", f"mask.kind is {kind}")
+    _describe_anchors(system, draft)
+    if system.part["loss"].lambda_perceptual > 0:
+        draft.add("perceptual network", "LPIPS with VGG-16", WEIGHT_BYTES)
+    else:
+        draft.leave_out("perceptual network", "loss.lambda_perceptual is 0")
 
 
-def _decide_anchors(system: EditSystem, decide) -> None:
-    lambdas = system.part["anchor"].lambdas
-    own = {name: tensor_bytes(system.splats.parameters[name]) for name in PARAMETERS if name in lambdas}
+def _describe_anchors(system: EditSystem, draft: Draft) -> None:
     config = system.part["anchor"]
-    why = "anchor.kind is none" if config.kind == "none" else "all its weights are 0"
-    size = sum(own.values()) + 8 * len(system.splats)
-    decide(bool(lambdas), "anchors", f"{config.kind}, {config.form}, of {', '.join(own)}", why, size)
+    if not config.lambdas:
+        why = "anchor.kind is none" if config.kind == "none" else "all its weights are 0"
+        draft.leave_out("anchors", why)
+        return
+    own = {name: tensor_bytes(system.splats.parameters[name]) for name in PARAMETERS if name in config.lambdas}
+    note = f"{config.kind}, {config.form}, of {', '.join(own)}"
+    draft.add("anchors", note, sum(own.values()) + 8 * len(system.splats))
     for name in PARAMETERS:
-        if lambdas and name not in lambdas:
-            decide(False, f"anchor of {name}", "", "its lambda is 0")
-
-
-def system_states(system: EditSystem) -> set[str]:
-    """States that other parts count."""
-    return {*STATISTICS, GENERATION, *(system.generations.states if system.generations else ())}
+        if name not in config.lambdas:
+            draft.leave_out(f"anchor of {name}", "its lambda is 0")

@@ -29,6 +29,7 @@ from ..scene.ply import read_ply, write_ply
 from . import results
 from .densify import STATISTICS, DensifyConfig, densify, observe, reset_opacity, screen_statistics
 from .optim import LearningRates
+from .plan import Draft, Plan
 from .results import ReportConfig
 
 
@@ -86,6 +87,9 @@ class SplatSystem(plugin.BaseSystem):
     def make_splats(self, scene: Gaussians) -> Splats:
         """The trainable form of `scene`."""
         return Splats(scene)
+
+    def describe(self, draft: Draft) -> None:
+        """Add to the plan what only this system builds or leaves out."""
 
     def after_update(self) -> None:
         """What else moves splats in a step, after the optimizer has."""
@@ -187,7 +191,16 @@ class SplatSystem(plugin.BaseSystem):
             raise ConfigError("trainer.max_steps: got none, expected the number of steps: schedules run over it.")
         return steps
 
+    def plan(self) -> Plan:
+        """What this run builds and leaves out."""
+        draft = Draft(self)
+        self.describe(draft)
+        return draft.finish()
+
     def on_train_start(self) -> None:
+        plan = self.plan()
+        plan.write(self.report_dir / "plan.json")
+        plugin.info(plan.text())
         self._started = time.perf_counter()
         if self.true_global_step == 0:
             self.report_row(0)
