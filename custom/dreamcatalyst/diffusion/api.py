@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,11 +38,13 @@ class Prior(ABC):
     alphas_cumprod [T] float64 on the CPU: abar_t of timestep index t = 0..T-1 (Ho et al. 2020).
     takes_image: whether the image condition means anything (False for text-to-image models).
     exact: whether the edit of an image is known in closed form (`known_edit`).
+    instructions: all that the prior was taught, wordings by edit; None where it is open to any.
     """
 
     alphas_cumprod: Tensor
     takes_image: bool = True
     exact: bool = False
+    instructions: Mapping[str, Sequence[str]] | None = None
 
     @property
     def weight_bytes(self) -> int:

@@ -24,6 +24,8 @@ CONFIGS = {
     "tokenizer": "tokenizer_config.json",
     "scheduler": "scheduler_config.json",
 }
+SHIPPED_NAME, SHIPPED = "demo:prior", Path(__file__).resolve().parents[1] / "demo" / "prior"
+INSTRUCTIONS = "instructions.json"  # of a model that was taught a list of edits: name of the edit to its wordings
 PREDICTIONS = ("epsilon", "v_prediction", "sample")
 
 
@@ -58,6 +60,11 @@ class Folder:
     def prediction_type(self) -> str:
         return self.scheduler.get("prediction_type", "epsilon")
 
+    def instructions(self) -> dict[str, list[str]] | None:
+        """What the model was taught, wordings by edit; None where the folder does not say."""
+        file = self.path / INSTRUCTIONS
+        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+
     def alphas_cumprod(self) -> Tensor:
         """abar_t [T] float64. The betas are the folder's (float32, as trained); their product is taken in float64,
         because rules that divide by 1 - abar_t / abar_{t-1} would see the rounding of a float32 product."""
@@ -89,9 +96,10 @@ def open_folder(path: str, conditioned: bool) -> Folder:
 def find_folder(path: str, holds: str, example: str) -> Path | None:
     """The local folder `path`, or None where it can be an id of the hub. Raises PriorError where it is neither.
 
-    holds: what belongs into the folder; example: an id; both for the message.
+    holds: what belongs into the folder; example: an id; both for the message. "demo:prior" is the small model that lies
+    in this package.
     """
-    folder = Path(path).expanduser()
+    folder = SHIPPED if path == SHIPPED_NAME else Path(path).expanduser()
     if folder.is_dir():
         return folder
     if folder.is_absolute() or path.startswith((".", "~")) or len(folder.parts) != 2:

@@ -30,7 +30,7 @@ class Ip2pConfig:
     """What to load and how to run it. The options that save memory bear the names that diffusers gives them. Effects
     are those of `benchmarks/guidance_step.py --size sd15 --pixels 256` on two CPU cores in fp32, per step.
 
-    path: a Hugging Face id, or a local folder of the same layout.
+    path: a Hugging Face id, or a local folder of the same layout; demo:prior is the small one that comes along.
     dtype: precision of all weights and activations, fp32, fp16 or bf16. Latents and gradients stay the caller's; the
         gradient through a half-precision encoder is kept in range by itself, so no loss scaling is needed.
     autoencoder: null for the folder's, or folder or id of an AutoencoderTiny (madebyollin/taesd): cheaper, blurrier
@@ -94,7 +94,7 @@ class LatentDiffusion(Prior):
         check_memory(folder, self.dtype, self.device, offload=config.offload, tiny=config.autoencoder is not None)
         self.alphas_cumprod, self.prediction_type = folder.alphas_cumprod(), folder.prediction_type
         self.text_width, self.latent_channels = folder.unet["cross_attention_dim"], folder.latent_channels
-        self.max_rows = config.max_rows
+        self.max_rows, self.instructions = config.max_rows, folder.instructions()
 
         self.tokenizer = load_tokenizer(folder)
         self.max_tokens = folder.text_encoder.get("max_position_embeddings", 77)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from torch import Tensor
 from .. import plugin
 from ..cache import ByteCache
 from ..data.camera import Cameras
+from ..demo.edits import normalised
 from ..errors import ConfigError, SceneError, choose
 from ..guidance.guidance import Guidance, GuidanceConfig
 from ..loss.anchor import AnchorConfig, anchor_loss, anchor_step
@@ -28,6 +29,7 @@ from .confine import confine, seen_mask
 from .plan import Draft, describe_edit
 from .preview import PreviewConfig, preview_sheet
 from .system import SplatSystem
+from .truth import Truth, find_truth
 
 PHOTO_WARNING_DB = 15.0  # below it a source render and its photograph have hardly anything in common
 
@@ -63,6 +65,16 @@ class LossConfig:
             )
 
 
+def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> None:
+    """Say so where a prior that was taught a list of edits has not heard of this one."""
+    if taught is None or normalised(prompt) in {normalised(text) for texts in taught.values() for text in texts}:
+        return
+    plugin.warn(
+        f'"{prompt}" is nothing that this small model was taught, and what comes of it is chance. It knows, in several '
+        f"wordings: {', '.join(taught)}. InstructPix2Pix is open to any instruction: configs/dc-ge-ip2p.yaml"
+    )
+
+
 @plugin.register("dreamcatalyst-edit-system")
 class EditSystem(SplatSystem):
     """Edits the splats of gs_source (or of a made world) as the instruction says."""
@@ -95,6 +107,7 @@ class EditSystem(SplatSystem):
             choose("mode", self.cfg.mode, self.cfg.steps, "system.mode")
         self.guidance: Guidance | None = None
         self.source: Gaussians | None = None
+        self.truth: Truth | None = None
         self.perceptual: Lpips | None = None
         self.generations = self.part["anchor"].generations()
         self._source_renders = ByteCache(self.cfg.source_cache_mib * 2**20)
@@ -114,6 +127,7 @@ class EditSystem(SplatSystem):
         if self.guidance is None:
             words: PromptConfig = self.part["prompt_processor"]
             self.guidance = Guidance(self.part["guidance"], words.prompt, words.source_prompt, device=self.root_device)
+            warn_of_unknown(self.guidance.prior.instructions, words.prompt)
         losses: LossConfig = self.part["loss"]
         if losses.lambda_perceptual and self.perceptual is None:
             if self.guidance.rule.delivers == "gradient":
@@ -125,6 +139,10 @@ class EditSystem(SplatSystem):
         if self.source is None:
             given = self.given_scene() if not self.cfg.original else read_ply(self.cfg.original)
             self.source = given.to(self.root_device)
+            # Splats of one's own are another scene, and a prior that is exact has a truth of its own.
+            whole = not (self.cfg.gs_source or self.cfg.original or self.guidance.prior.exact)
+            words: PromptConfig = self.part["prompt_processor"]
+            self.truth = find_truth(self.data.world if whole else None, words.prompt, self.root_device)
 
     def first_scene(self) -> Gaussians:
         return self.given_scene() if self.cfg.original else self.source
@@ -200,19 +218,28 @@ class EditSystem(SplatSystem):
 
     def references(self, index: int) -> dict[str, Tensor]:
         source = self.source_render(index)
+        if self.truth is not None:
+            return {"truth": self.truth.image(self.draw, self.camera(index)), "source": source}
         known = self.guidance.known_edit(source, index)
         if known is None:
             return {"source": source}
         rest = self.guidance.expected(source, index)
         return {"edit": known, **({} if rest is None else {"fixed_point": rest}), "source": source}
 
+    def region(self, index: int) -> Tensor | None:
+        """Where one view is meant to change, [H,W,1] of 0 and 1: the thing itself where the truth is known, else what
+        the mask lets change; None for an edit of everything."""
+        if self.truth is not None:
+            return self.truth.region(self.draw, self.camera(index))
+        return None if self.splats.frozen is None else seen_mask(self, index).round()
+
     def score(self, index: int) -> dict[str, float]:
-        """As for every system; where the edit is confined, also inside the mask against the prior's edit, and outside
-        of it against the source."""
-        scores = super().score(index)
-        if self.splats.frozen is None:
+        """As for every system; where only a part is meant to change, also inside of it against the edit, and outside
+        against the source."""
+        scores, region = super().score(index), self.region(index)
+        if region is None:
             return scores
-        image, inside = self.picture(index)[None], seen_mask(self, index)[None].round()
+        image, inside = self.picture(index)[None], region[None]
         for name, reference in self.references(index).items():
             where, weight = ("outside", 1 - inside) if name == "source" else ("inside", inside)
             if bool(weight.any()):  # a view may show nothing of either
@@ -221,10 +248,10 @@ class EditSystem(SplatSystem):
         return scores
 
     def panels(self, index: int) -> list[tuple[str, Tensor]]:
-        source = self.source_render(index)
-        known = self.guidance.known_edit(source, index)
+        source, references = self.source_render(index), self.references(index)
         shown = [("source", source), (f"edited, step {self.true_global_step}", self.picture(index))]
-        return shown if known is None else [*shown, ("the prior's edit", known)]
+        names = {"truth": "the truth", "edit": "the prior's edit"}
+        return [*shown, *((label, references[name]) for name, label in names.items() if name in references)]
 
     def video_frame(self, cameras: Cameras) -> list[tuple[str, Tensor]]:
         edited = self.draw_now(cameras).rgb[0]
