@@ -22,7 +22,8 @@ import torch
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "custom"))
 
-from dreamcatalyst.demo.pairs import world_pairs  # noqa: E402
+from dreamcatalyst.demo.pairs import CAMERAS, world_pairs  # noqa: E402
+from dreamcatalyst.demo.random_world import random_world  # noqa: E402
 from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig  # noqa: E402
 from dreamcatalyst.report.pictures import write_png  # noqa: E402
 from dreamcatalyst.train.prior.data import Pairs  # noqa: E402
@@ -45,7 +46,7 @@ def judged_pairs(worlds: int, size: int) -> Pairs:
     found = []
     for seed in range(worlds):
         cameras: dict[str, list] = {}
-        for pair in world_pairs(seed, size):
+        for pair in world_pairs(random_world(seed, CAMERAS, size), np.random.default_rng(seed)):
             cameras.setdefault(str(pair["edit"]), []).append(pair)
         found += [views[(seed + i) % len(views)] for i, views in enumerate(cameras.values())]
     return Pairs({key: np.stack([np.asarray(pair[key]) for pair in found]) for key in found[0]})

@@ -17,6 +17,7 @@ from ... import plugin
 from ...config import parse
 from ...data.views import views_for_step
 from ...demo.pairs import make_pairs, read_pairs
+from ...demo.photographs import PHOTOGRAPHS
 from ...diffusion.operators import find_operator
 from ...errors import ConfigError, DataError
 
@@ -33,6 +34,14 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.instruction)
+
+    @property
+    def wordings(self) -> dict[str, list[str]]:
+        """The instructions of each edit, in lower case and without a full stop."""
+        found: dict[str, set[str]] = {}
+        for edit, text in zip(self.edit.tolist(), self.instruction.tolist(), strict=True):
+            found.setdefault(edit, set()).add(text.lower().rstrip("."))
+        return {edit: sorted(texts) for edit, texts in sorted(found.items())}
 
     def images(self, kind: str, index: Index) -> Tensor:
         """Images of pairs, [B,3,H,W] in [0,1]. kind: source or edited."""
@@ -116,6 +125,21 @@ class PriorData(plugin.pl.LightningDataModule):
         self.train = np.flatnonzero(world < worlds[-enough])
         if not len(self.train):
             raise DataError(f"{self.folder}: all pairs are of one world, expected several: some are held out whole")
+
+    @property
+    def origin(self) -> str:
+        """Where the pairs come from, in words, with the photographs' authors and licences."""
+        if not (self.folder / "pairs.json").exists():
+            return f"Pairs of {self.folder}."
+        text = "Renders of small worlds that the project makes itself, before and after an edit in 3D."
+        if (self.pairs.world >= 0).all():
+            return text
+        credits = "\n".join(
+            f"- {distribution}, `{Path(name).name}`: {licence}"
+            for _, distribution, files in PHOTOGRAPHS
+            for name, licence in files.items()
+        )
+        return f"{text} And crops of photographs, edited by image operators:\n\n{credits}"
 
     def held_out_spread(self, wanted: int) -> np.ndarray:
         """At most `wanted` of the held-out pairs, evenly spread over them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -50,7 +51,10 @@ pipeline_tag: image-to-image
 {megabytes:.1f} MB: an AutoencoderKL, a CLIP text encoder and a U-Net on latents, for images of {size} x {size} pixels,
 trained from nothing on {pairs:,} pairs by `python launch.py --config configs/prior.yaml`.
 It knows small made worlds (bear statues, balls, boxes, plants on open ground or in rooms) and these edits of them, each
-in several wordings (`instructions.json`): {edits}.
+in several wordings (`instructions.json`):
+
+{edits}.
+
 Photographs, other objects and other instructions are beyond it.
 
 Trained: autoencoder {autoencoder:,} steps, text encoder and U-Net {unet:,} steps. Scheduler: {scheduler}.
@@ -104,12 +108,13 @@ def write_prior(
         if name == "vae":
             half.register_to_config(scaling_factor=round(1 / latent_std, 5))
         half.save_pretrained(folder / name, safe_serialization=True)
+    _say_float32(folder / "text_encoder/config.json")
     length = networks["text_encoder"].config.max_position_embeddings
     write_tokenizer(folder / "tokenizer", merges, length)
     facts = {
         "megabytes": sum(p.numel() for network in networks.values() for p in network.parameters()) * 2 / 1e6,
         "size": networks["vae"].config.sample_size,
-        "edits": ", ".join(sorted(instructions)),
+        "edits": textwrap.fill(", ".join(sorted(instructions)), 118),
         "scheduler": f"{SCHEDULER['beta_schedule']}, {SCHEDULER['prediction_type']}",
     }
     texts = {
@@ -123,3 +128,11 @@ def write_prior(
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
     return folder
+
+
+def _say_float32(config: Path) -> None:
+    """Newer versions of transformers load weights in the precision that the config names, and the pipeline would mix
+    it with the float32 that diffusers loads by default."""
+    values = json.loads(config.read_text(encoding="utf-8"))
+    values = {key: "float32" if key in ("dtype", "torch_dtype") else value for key, value in values.items()}
+    config.write_text(json.dumps(values, indent=2), encoding="utf-8")

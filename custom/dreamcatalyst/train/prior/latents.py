@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,17 +17,20 @@ KINDS = ("source", "edited")
 
 @torch.no_grad()
 def encode_pairs(vae: nn.Module, pairs: Pairs, device: torch.device) -> dict[str, Tensor]:
-    """The posterior's mode of every pair, unscaled, float16 [n,C,h,w] on the CPU, as "source" and "edited"."""
+    """The posterior's mode of all n pairs and of their mirror images, unscaled, as "source" and "edited": float16
+    [2n,C,h,w] on the CPU, pair i at i and mirrored at n + i."""
     n = len(pairs)
-    meter = Meter("encode", 2 * n, "image", passing=True)
-    made: dict[str, Any] = {}
+    meter = Meter("encode", 4 * n, "image", passing=True)
+    made: dict[str, Tensor] = {}
     for done, kind in enumerate(KINDS):
-        parts = []
+        parts: tuple[list[Tensor], list[Tensor]] = ([], [])
         for start in range(0, n, BATCH):
-            images = pairs.images(kind, slice(start, start + BATCH)).to(device)
-            parts.append(vae.encode(images * 2 - 1).latent_dist.mode().half().cpu())
-            meter.update(done * n + start)
-        made[kind] = torch.cat(parts)
+            images = pairs.images(kind, slice(start, start + BATCH)).to(device) * 2 - 1
+            for part, view in zip(parts, (images, images.flip(-1)), strict=True):
+                view = view.contiguous(memory_format=torch.channels_last)
+                part.append(vae.encode(view).latent_dist.mode().half().cpu())
+            meter.update(2 * (done * n + start))
+        made[kind] = torch.cat([*parts[0], *parts[1]])
     meter.close()
     return made
 

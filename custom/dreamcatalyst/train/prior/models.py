@@ -7,6 +7,7 @@ transformers, so that what is trained here loads wherever the large model does.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from torch import nn
@@ -110,11 +111,11 @@ def _divisible(channels: tuple[int, ...], groups: int, name: str) -> None:
 
 
 def make_autoencoder(config: AutoencoderConfig, size: int) -> nn.Module:
-    """A random AutoencoderKL for images of `size` pixels. No attention: it would look no further than a crop."""
+    """AutoencoderKL for images of `size` pixels, new. No attention: it would look no further than a crop."""
     from diffusers import AutoencoderKL
 
     levels = len(config.channels)
-    return AutoencoderKL(
+    vae = AutoencoderKL(
         block_out_channels=config.channels,
         down_block_types=("DownEncoderBlock2D",) * levels,
         up_block_types=("UpDecoderBlock2D",) * levels,
@@ -124,6 +125,33 @@ def make_autoencoder(config: AutoencoderConfig, size: int) -> nn.Module:
         sample_size=size,
         mid_block_add_attention=False,
     )
+    begin_with_colours(vae)
+    return vae
+
+
+@torch.no_grad()
+def begin_with_colours(vae: nn.Module) -> None:
+    """Let the image's colours through from the start: the first three channels carry them from convolution to
+    convolution, averaged where the image is halved, beside random features. From random weights alone thousands of
+    steps go by before the autoencoder has more than brightness to tell."""
+    centre, quarters = ((1, 1),), ((0, 0), (0, 1), (1, 0), (1, 1))
+    for name, conv in vae.named_modules():
+        if name.endswith("downsamplers.0.conv"):
+            _pass_on(conv, quarters)
+        elif name.endswith(("conv_shortcut", "quant_conv")):
+            _pass_on(conv, ((0, 0),))
+        elif name.endswith(("conv_in", "upsamplers.0.conv")):
+            _pass_on(conv, centre)
+        elif name.endswith("conv_out"):
+            _pass_on(conv, centre, gain=2.0)  # after a SiLU, whose slope at zero is a half
+
+
+def _pass_on(conv: nn.Module, taps: tuple[tuple[int, int], ...], gain: float = 1.0) -> None:
+    """Make the first three channels of a convolution those of its input, as the mean over `taps` (row, column)."""
+    conv.weight[:3] = 0
+    conv.bias[:3] = 0
+    for channel, (row, column) in product(range(3), taps):
+        conv.weight[channel, channel, row, column] = gain / len(taps)
 
 
 def make_text_encoder(config: TextConfig, vocabulary: int) -> nn.Module:

@@ -74,7 +74,6 @@ class PriorSystem(plugin.BaseSystem):
         text: dict = field(default_factory=dict)
         unet: dict = field(default_factory=dict)
         samples: dict = field(default_factory=dict)
-        origin: str = "Made by `custom/dreamcatalyst/demo`."  # where the pairs come from, for the model card
 
     # --- setting up
 
@@ -192,7 +191,8 @@ class PriorSystem(plugin.BaseSystem):
         no_text = draw < text_end
         no_image = (text_end <= draw) & (draw < image_end)
         neither = (image_end <= draw) & (draw < image_end + config.drop_both)
-        source, edited = (self.latents[kind][index].float() for kind in ("source", "edited"))
+        place = index + len(self.data.pairs) * rng.integers(0, 2, len(index))  # mirrored or not
+        source, edited = (self.latents[kind][place].float() for kind in ("source", "edited"))
         clean = torch.where(_column(no_text), source, edited)
         image = source * _column(~(no_image | neither))
         given = self.data.pairs.instruction[index]
@@ -305,16 +305,10 @@ class PriorSystem(plugin.BaseSystem):
 
     def write_folder(self) -> Path:
         """Write the model of the moment under the run's save folder."""
-        pairs = self.data.pairs
-        wordings: dict[str, list[str]] = {}
-        for edit, text in sorted(set(zip(pairs.edit.tolist(), pairs.instruction.tolist(), strict=True))):
-            wordings.setdefault(edit, []).append(text)
-        card = {"pairs": len(self.data.train), "origin": self.cfg.origin}
-        card |= {name: self.progress[name].steps(self.true_global_step, after) for name, after in self._ends()}
-        return write_prior(self.path("prior"), self.ema, self.merges, float(self.latent_std), wordings, card)
-
-    def _ends(self) -> list[tuple[str, int | None]]:
-        return [("autoencoder", self.progress["unet"].first), ("unet", None)]
+        data, ends = self.data, {"autoencoder": self.progress["unet"].first, "unet": None}
+        done = {name: self.progress[name].steps(self.true_global_step, end) for name, end in ends.items()}
+        card = {"pairs": len(data.train), "origin": data.origin, **done}
+        return write_prior(self.path("prior"), self.ema, self.merges, float(self.latent_std), data.pairs.wordings, card)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         progress = {name: asdict(progress) for name, progress in self.progress.items()}
