@@ -25,6 +25,7 @@ sys.path.insert(0, str(ROOT / "custom"))
 
 from dreamcatalyst.data.camera import Cameras  # noqa: E402
 from dreamcatalyst.render.api import rasterize  # noqa: E402
+from dreamcatalyst.render.frozen import Frozen  # noqa: E402
 from dreamcatalyst.scene.gaussians import Gaussians  # noqa: E402
 
 SIZES = ((20_000, 128), (20_000, 256), (100_000, 256), (100_000, 512))
@@ -63,12 +64,14 @@ def prepared(n: int, side: int, sh_degree: int = 0) -> tuple[dict, Gaussians, Ca
     return scene, splats, Cameras(scene["viewmat"][None], scene["K"][None], side, side)
 
 
-def timed(splats: Gaussians, cameras: Cameras, cotangent: torch.Tensor, backend: str = "cpu") -> tuple[float, float]:
+def timed(
+    splats: Gaussians, cameras: Cameras, cotangent: torch.Tensor, backend: str = "cpu", frozen: Frozen | None = None
+) -> tuple[float, float]:
     """Seconds of one forward and one backward pass: projection, colours, compositing."""
     for _, parameter in splats.parameters():
         parameter.grad = None
     start = time.perf_counter()
-    image = rasterize(splats, cameras, backend=backend).rgb
+    image = rasterize(splats, cameras, backend=backend, frozen=frozen).rgb
     middle = time.perf_counter()
     image.backward(cotangent)
     return middle - start, time.perf_counter() - middle
@@ -77,7 +80,7 @@ def timed(splats: Gaussians, cameras: Cameras, cotangent: torch.Tensor, backend:
 def intersections(splats: Gaussians, cameras: Cameras) -> tuple[int, float]:
     """Pairs of splat and tile of one view, and MiB that the graph holds and the backward pass takes for them."""
     rgb = rasterize(splats, cameras, backend="cpu").rgb
-    order, first_slots, drawn = rgb.grad_fn.lists[0]
+    _, order, first_slots, drawn = rgb.grad_fn.lists[0]
     slots = int(first_slots[-1])
     held = sum(a.nbytes for a in (order, first_slots, *drawn) if isinstance(a, np.ndarray))
     return slots, (held + slots * (9 * 4 + 1)) / 2**20

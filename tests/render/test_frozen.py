@@ -10,6 +10,7 @@ import pytest
 import torch
 from dreamcatalyst.data.camera import Cameras
 from dreamcatalyst.errors import SceneError
+from dreamcatalyst.render import cpu_frozen
 from dreamcatalyst.render.api import BACKENDS, rasterize
 from dreamcatalyst.render.frozen import Frozen
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
@@ -123,16 +124,23 @@ def test_options_are_those_of_one_scene(random_scene, pinhole, backend, options)
     assert_close(got, true, *((1e-10,) if backend == "reference" else (1e-4, 0.004)))
 
 
+@pytest.fixture(params=["one round", "two rounds"])
+def rounds(request, monkeypatch):
+    """Two rounds even where few splats are edited: the nearest of them first, then, in tiles left open, all."""
+    if request.param == "two rounds":
+        monkeypatch.setattr(cpu_frozen, "MANY", cpu_frozen.NEAREST)
+
+
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("size", [(61, 47), (8, 16), (9, 17), (1, 1), (3, 64)])
-def test_cpu_is_the_cpu_on_one_scene(random_scene, pinhole, case, size):
+def test_cpu_is_the_cpu_on_one_scene(random_scene, pinhole, case, size, rounds):
     """The same kernels in the same order: nothing but the last digits differs, the background's derivative too."""
     (frozen, scene), cameras = parts(random_scene, case, sh_degree=1), pinhole(*size, views=2)
     true = draw(joined(frozen, scene), None, cameras, len(frozen), backend="cpu")
     assert_close(draw(scene, Frozen(frozen), cameras, backend="cpu"), true, 5e-6)
 
 
-def test_deep_lists(random_scene, pinhole):
+def test_deep_lists(random_scene, pinhole, rounds):
     """Thousands of faint splats on few pixels: the stop at small transmittance, with frozen splats all about."""
     scene = random_scene(3000, 0)
     scene.means[:, :2] *= 0.01
@@ -152,8 +160,20 @@ def test_frozen_splats_take_no_derivative(random_scene, pinhole, backend):
     assert all(value.grad is None for _, value in frozen.parameters())
 
 
+def test_opaque_on_one_side_and_faint_on_the_other(random_scene, pinhole):
+    """So many edited splats that tiles are finished by the nearest of them on the left, by none on the right."""
+    scene = random_scene(9000, 0)
+    scene.logit_opacities[:] = torch.where(scene.means[:, 0] < 0, 3.0, -5.0)
+    frozen, edited, cameras = scene[6000:], scene[:6000], pinhole(64, 48, views=2)
+    assert len(edited) >= cpu_frozen.MANY
+    true = draw(joined(frozen, edited), None, cameras, len(frozen), backend="cpu")
+    alpha = true[0]["alpha"]
+    assert (alpha[:, :, 10:24] > 0.9998).double().mean() > 0.5 and (alpha[:, :, -20:] < 0.99).double().mean() > 0.5
+    assert_close(draw(edited, Frozen(frozen), cameras, backend="cpu"), true, 2e-5)
+
+
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
-def test_same_bits_whatever_the_number_of_threads(random_scene, pinhole):
+def test_same_bits_whatever_the_number_of_threads(random_scene, pinhole, rounds):
     scene, cameras, threads = random_scene(3000, 1), pinhole(61, 47, views=2), numba.get_num_threads()
     runs = []
     for count in (1, 2):
@@ -164,7 +184,7 @@ def test_same_bits_whatever_the_number_of_threads(random_scene, pinhole):
         assert all(torch.equal(one[name], two[name]) for name in one)
 
 
-def test_results_do_not_depend_on_what_is_kept(random_scene, pinhole):
+def test_results_do_not_depend_on_what_is_kept(random_scene, pinhole, rounds):
     """Bit by bit: nothing kept, kept from splats elsewhere (too few tiles, then more than needed), kept in part."""
     (frozen, scene), cameras = parts(random_scene, "in a corner", 1), pinhole(200, 160, views=3)
     moved = scene.clone()

@@ -7,6 +7,7 @@ float32 only. Every sum has a fixed order, so that the same bits come out whatev
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -156,21 +157,20 @@ class Composite(torch.autograd.Function):
         for v in range(views):
             xy, conic, color, opacity, z = _arrays(means2d[v], conics[v], colors[v], opacities[v], depths[v])
             order = cpu_tiles.depth_order(z, radii[v].numpy())
-            packed, starts, entries, first_slots = cpu_tiles.tile_lists(
-                order, xy, conic, opacity, color, width, height
-            )
-            extra = np.empty((len(order), 0), np.float32) if extras is None else _arrays(extras[v])[0][order]
-            spans, rested = cpu_composite.spans(starts), 0
-            if behind is not None:
-                view = behind(v, np.flatnonzero(np.diff(starts)))
-                cpu_frozen.paint(view.image, shade_behind, rgb[v], alpha[v])
-                packed, spans, entries = cpu_frozen.merge(view, packed, z[order], starts, entries)
-                rested = len(spans)
-            final = np.empty((len(spans), cpu_composite.PIXELS), np.float32)
-            last, rest = np.empty_like(final), np.empty((rested, 4, cpu_composite.PIXELS), np.float32)
-            drawn = packed, extra, spans, entries, width, height, shade_behind
-            cpu_composite.forward(*drawn, rgb[v], alpha[v], image[v], final, last, rest)
-            ctx.lists.append((order, first_slots, (*drawn, final, last, rest)))
+            splats = xy, conic, opacity, color
+            if behind is None:
+                extra = np.empty((len(order), 0), np.float32) if extras is None else _arrays(extras[v])[0][order]
+                packed, starts, entries, first_slots = cpu_tiles.tile_lists(order, *splats, width, height)
+                spans = cpu_composite.spans(np.arange(len(starts) - 1), starts[1:], width, height)
+                drawn = packed, extra, spans, entries, width, height, shade_behind
+                final = np.empty((len(spans), cpu_composite.PIXELS), np.float32)
+                state = final, np.empty_like(final), np.empty((0, 4, cpu_composite.PIXELS), np.float32)
+                cpu_composite.forward(*drawn, rgb[v], alpha[v], image[v], *state)
+                rounds = [(order, first_slots, (*drawn, *state))]
+            else:
+                find = partial(behind, v)
+                rounds = cpu_frozen.draw(find, order, z, radii[v].numpy(), splats, shade_behind, rgb[v], alpha[v])
+            ctx.lists += [(v, *lists) for lists in rounds]
         ctx.shapes = n, channels
         alpha = torch.from_numpy(alpha)
         ctx.save_for_backward(alpha)
@@ -179,21 +179,23 @@ class Composite(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, g_rgb: Tensor, g_alpha: Tensor, g_image: Tensor):
-        (n, channels), views, (alpha,) = ctx.shapes, len(ctx.lists), ctx.saved_tensors
+        (n, channels), (alpha,) = ctx.shapes, ctx.saved_tensors
+        views = len(alpha)
         sizes = (views, n, 2), (views, n, 3), (views, n, 3), (views, n), (views, n, channels)
         g_means2d, g_conics, g_colors, g_opacities, g_extras = grads = [np.zeros(s, np.float32) for s in sizes]
         g_background = np.zeros(3, np.float32) if ctx.needs_input_grad[5] else None
-        for v, (order, first_slots, drawn) in enumerate(ctx.lists):
+        cotangents = [_arrays(g_rgb[v], g_alpha[v], g_image[v]) for v in range(views)]
+        for v, order, first_slots, drawn in ctx.lists:
             slots = np.empty((int(first_slots[-1]), 9 + channels), np.float32)
             used = np.zeros(len(slots), np.uint8)
-            cotangents = _arrays(g_rgb[v], g_alpha[v], g_image[v])
-            cpu_composite.backward(*drawn, *cotangents, slots, used)
+            cpu_composite.backward(*drawn, *cotangents[v], slots, used)
             targets = g_means2d[v], g_conics[v], g_opacities[v], g_colors[v], g_extras[v]
             cpu_composite.gather(order, first_slots, slots, used, *targets)
-            if g_background is not None:
-                rows = np.empty((alpha.shape[1], 3), np.float32)
-                cpu_composite.background_rows(alpha[v].numpy(), cotangents[0], rows)
-                g_background += rows.sum(axis=0)
+        if g_background is not None:
+            rows = np.empty((views, alpha.shape[1], 3), np.float32)
+            for v in range(views):
+                cpu_composite.background_rows(alpha[v].numpy(), cotangents[v][0], rows[v])
+            g_background += rows.sum(axis=(0, 1))
         out = [torch.from_numpy(g) for g in grads]
         g_background = None if g_background is None else torch.from_numpy(g_background)
         return *out[:4], out[4] if channels else None, g_background, *[None] * 5

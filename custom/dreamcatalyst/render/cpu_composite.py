@@ -32,9 +32,10 @@ from .thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 f32, u64 = np.float32, np.uint64
 PIXELS = TILE_W * TILE_H
 STRIDES = 64  # tasks: each takes every 64th tile, which evens out their work
-# Columns of a span, the work of one tile: its number; its entries begin:end; among them, first:after, outside of which
-# no splat takes derivatives. An entry is a packed splat and its slot, which is negative if it takes no derivatives.
-TILE, BEGIN, FIRST, AFTER, END = range(5)
+# Columns of a span, the work of one tile: its number; its rows of pixels that are drawn, top:bottom; its entries
+# begin:end; among them, first:after, outside of which no splat takes derivatives. An entry is a packed splat and its
+# slot, which is negative if it takes no derivatives.
+TILE, TOP, BOTTOM, BEGIN, FIRST, AFTER, END = range(7)
 LOOK = 8  # splats between two looks at whether a tile is finished
 ZERO, ONE, CUT, CAP, STOP = f32(0), f32(1), f32(ALPHA_MIN), f32(ALPHA_MAX), f32(TRANSMITTANCE_MIN)
 
@@ -52,9 +53,15 @@ _nodes = 0.375 + 0.375 * np.cos(np.pi * (np.arange(64) + 0.5) / 64)
 P5, P4, P3, P2, P1, P0 = (f32(c) for c in np.polyfit(_nodes, np.exp(-_nodes), 5, w=np.exp(_nodes)))
 
 
-def spans(starts: np.ndarray) -> np.ndarray:
-    """Spans [S,5] of all tiles from the places [S+1] where their lists start, where all splats take derivatives."""
-    return np.stack([np.arange(len(starts) - 1), starts[:-1], starts[:-1], starts[1:], starts[1:]], axis=1)
+def spans(tiles: np.ndarray, ends: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Spans [S,7] of the tiles numbered `tiles` [S], whose lists follow one another and end at `ends` [S]; all splats
+    take derivatives."""
+    out = np.zeros((len(tiles), 7), np.int64)
+    out[:, TILE], out[:, TOP] = tiles, tiles // -(-width // TILE_W) * TILE_H
+    out[:, BOTTOM] = np.minimum(out[:, TOP] + TILE_H, height)
+    out[1:, BEGIN], out[:, END] = ends[:-1], ends
+    out[:, FIRST], out[:, AFTER] = out[:, BEGIN], ends
+    return out
 
 
 @njit(fastmath=True, error_model="numpy")
@@ -67,10 +74,10 @@ def _exp_minus(s):
 
 
 @njit(fastmath=True, error_model="numpy")
-def _rows(packed, j, y0):
-    """Range of scratch indices of the tile's rows that packed splat j can touch."""
-    first = first_pixel(packed[j, PY] - packed[j, RY], y0, y0 + TILE_H - 1)
-    last = last_pixel(packed[j, PY] + packed[j, RY], y0, y0 + TILE_H - 1)
+def _rows(packed, j, y0, top, bottom):
+    """Range of scratch indices of the rows top:bottom of the tile at y0 that packed splat j can touch."""
+    first = first_pixel(packed[j, PY] - packed[j, RY], top, bottom - 1)
+    last = last_pixel(packed[j, PY] + packed[j, RY], top, bottom - 1)
     return u64((first - y0) * TILE_W), u64(max(last + 1 - y0, 0) * TILE_W)
 
 
@@ -175,7 +182,7 @@ def _undraw(s, start, stop, packed, j, number, slots, slot):
 
 
 @njit(fastmath=True, error_model="numpy")
-def _walk(s, more, packed, extras, entries, begin, here, there, y0):
+def _walk(s, more, packed, extras, entries, begin, here, there, y0, top, bottom):
     """Blend the entries here:there of a tile whose list begins at `begin`. Returns where all of its pixels were
     finished, which none of the later entries can change, else `there`."""
     for k in range(here, there):
@@ -186,7 +193,7 @@ def _walk(s, more, packed, extras, entries, begin, here, there, y0):
             if brightest < ZERO:
                 return k
         j = entries[k, 0]
-        start, stop = _rows(packed, j, y0)
+        start, stop = _rows(packed, j, y0, top, bottom)
         _draw(s, start, stop, packed, j, f32(k - begin + 1))
         for c in range(extras.shape[1]):
             value = extras[j, c]
@@ -197,7 +204,7 @@ def _walk(s, more, packed, extras, entries, begin, here, there, y0):
 
 @kernel(parallel=True, fastmath=True)
 def forward(packed, extras, spans, entries, width, height, background, rgb, alpha, image, final, last, rest):
-    """Fill the tiles of spans [S,5] in rgb [H,W,3], alpha [H,W,1] and image [H,W,E] of the extra channels extras [M,E],
+    """Fill the tiles of spans [S,7] in rgb [H,W,3], alpha [H,W,1] and image [H,W,E] of the extra channels extras [M,E],
     and move each END to where the tile was finished.
 
     For the backward pass: the transmittance `final` behind the entries before AFTER and the number of the last splat
@@ -208,13 +215,14 @@ def forward(packed, extras, spans, entries, width, height, background, rgb, alph
         s, more = np.empty(ROWS * PIXELS, np.float32), np.empty((channels, PIXELS), np.float32)
         for i in range(task, spans.shape[0], STRIDES):
             x0, y0 = _place(spans[i, TILE], tiles_x, s)
+            top, bottom = spans[i, TOP], spans[i, BOTTOM]
             s[T:] = ZERO
             more[:] = ZERO
             for y in range(TILE_H):
-                for x in range(TILE_W):  # pixels outside of the image count as finished
-                    s[T + u64(y * TILE_W + x)] = ONE if x0 + x < width and y0 + y < height else -ONE
+                for x in range(TILE_W):  # pixels that are not drawn count as finished
+                    s[T + u64(y * TILE_W + x)] = ONE if x0 + x < width and top <= y0 + y < bottom else -ONE
             begin, after, end = spans[i, BEGIN], spans[i, AFTER], spans[i, END]
-            spans[i, END] = _walk(s, more, packed, extras, entries, begin, begin, after, y0)
+            spans[i, END] = _walk(s, more, packed, extras, entries, begin, begin, after, y0, top, bottom)
             for p in range(PIXELS):
                 q = u64(p)
                 final[i, p], last[i, p] = abs(s[T + q]), s[LAST + q]
@@ -222,7 +230,7 @@ def forward(packed, extras, spans, entries, width, height, background, rgb, alph
                 for p in range(PIXELS):
                     q = u64(p)
                     rest[i, 0, p], rest[i, 1, p], rest[i, 2, p] = s[C0 + q], s[C1 + q], s[C2 + q]
-                spans[i, END] = _walk(s, more, packed, extras, entries, begin, after, end, y0)
+                spans[i, END] = _walk(s, more, packed, extras, entries, begin, after, end, y0, top, bottom)
                 for p in range(PIXELS):
                     q = u64(p)
                     t = abs(s[T + q])
@@ -233,7 +241,7 @@ def forward(packed, extras, spans, entries, width, height, background, rgb, alph
             for p in range(PIXELS):
                 q = u64(p)
                 y, x = y0 + p // TILE_W, x0 + p % TILE_W
-                if x < width and y < height:
+                if x < width and top <= y < bottom:
                     t = abs(s[T + q])
                     alpha[y, x, 0] = ONE - t
                     rgb[y, x, 0] = s[C0 + q] + t * background[0]
@@ -268,13 +276,14 @@ def backward(
         s, more = np.zeros(ROWS * PIXELS, np.float32), np.zeros((channels, PIXELS), np.float32)
         for i in range(task, spans.shape[0], STRIDES):
             x0, y0 = _place(spans[i, TILE], tiles_x, s)
+            top, bottom = spans[i, TOP], spans[i, BOTTOM]
             s[T:] = ZERO
             more[:] = ZERO
             deepest, rested = ZERO, spans[i, AFTER] < spans[i, END]
             for p in range(PIXELS):
                 q = u64(p)
                 y, x = y0 + p // TILE_W, x0 + p % TILE_W
-                if x < width and y < height:
+                if x < width and top <= y < bottom:
                     t, v0, v1, v2 = final[i, p], v_rgb[y, x, 0], v_rgb[y, x, 1], v_rgb[y, x, 2]
                     s[T + q], s[LAST + q] = t, last[i, p]
                     s[V0 + q], s[V1 + q], s[V2 + q] = v0, v1, v2
@@ -290,7 +299,7 @@ def backward(
             begin = spans[i, BEGIN]
             for k in range(begin + int(deepest) - 1, spans[i, FIRST] - 1, -1):
                 j, slot = entries[k, 0], entries[k, 1]
-                start, stop = _rows(packed, j, y0)
+                start, stop = _rows(packed, j, y0, top, bottom)
                 if slot < 0:
                     _pass(s, start, stop, packed, j, f32(k - begin + 1))
                     continue

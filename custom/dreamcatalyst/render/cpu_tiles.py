@@ -90,9 +90,9 @@ def _tile_rows(packed, j, height):
 
 
 @kernel(parallel=True)
-def _pack(order, means2d, conics, opacities, colors, width, height, packed, counts, pairs):
+def _pack(order, means2d, conics, opacities, colors, width, height, open_tiles, packed, counts, pairs):
     """Copy the drawn splats next to each other in the order in which they are drawn, to packed [M,COLUMNS]; count the
-    splats of each tile per chunk, counts [CHUNKS,tiles], and the tiles of each splat, pairs [M]."""
+    splats of each open tile per chunk, counts [CHUNKS,tiles], and the open tiles of each splat, pairs [M]."""
     n, tiles_x, size = order.size, -(-width // TILE_W), -(-order.size // CHUNKS)
     for chunk in prange(CHUNKS):
         for j in range(chunk * size, min(n, (chunk + 1) * size)):
@@ -109,8 +109,8 @@ def _pack(order, means2d, conics, opacities, colors, width, height, packed, coun
             for row in range(top, bottom + 1):
                 left, right = _columns(packed, j, row, width, height)
                 for t in range(row * tiles_x + left, row * tiles_x + right + 1):
-                    counts[chunk, t] += 1
-                pairs[j] += max(right - left + 1, 0)
+                    counts[chunk, t] += open_tiles[t]
+                    pairs[j] += open_tiles[t]
 
 
 @kernel()
@@ -129,7 +129,7 @@ def _offsets(counts, starts, first_slots):
 
 
 @kernel(parallel=True)
-def _fill(packed, width, height, counts, first_slots, entries):
+def _fill(packed, width, height, open_tiles, counts, first_slots, entries):
     n, tiles_x, size = packed.shape[0], -(-width // TILE_W), -(-packed.shape[0] // CHUNKS)
     for chunk in prange(CHUNKS):
         for j in range(chunk * size, min(n, (chunk + 1) * size)):
@@ -138,24 +138,31 @@ def _fill(packed, width, height, counts, first_slots, entries):
             for row in range(top, bottom + 1):
                 left, right = _columns(packed, j, row, width, height)
                 for t in range(row * tiles_x + left, row * tiles_x + right + 1):
+                    if not open_tiles[t]:
+                        continue
                     entry = counts[chunk, t]
                     counts[chunk, t] = entry + 1
                     entries[entry, 0], entries[entry, 1] = j, slot
                     slot += 1
 
 
-def tile_lists(order, means2d, conics, opacities, colors, width: int, height: int):
+def tile_lists(
+    order, means2d, conics, opacities, colors, width: int, height: int, open_tiles: np.ndarray | None = None
+):
     """Return (packed [M,COLUMNS], starts [tiles+1], entries [I,2], first_slots [M+1]) of the drawn splats `order` [M].
 
     entries[starts[t]:starts[t+1]] are the splats of tile t front to back, each with its slot: the number of the pair
     (splat, tile) where pairs are counted splat by splat. Splat j has the slots first_slots[j]:first_slots[j+1].
+    open_tiles [tiles] bool: the lists of the others stay empty (default: all are open).
     """
     tiles = -(-width // TILE_W) * -(-height // TILE_H)
+    if open_tiles is None:
+        open_tiles = np.ones(tiles, bool)
     packed = np.empty((len(order), COLUMNS), np.float32)
     counts, first_slots = np.zeros((CHUNKS, tiles), np.int32), np.zeros(len(order) + 1, np.int64)
     starts = np.zeros(tiles + 1, np.int64)
-    _pack(order, means2d, conics, opacities, colors, width, height, packed, counts, first_slots[1:])
+    _pack(order, means2d, conics, opacities, colors, width, height, open_tiles, packed, counts, first_slots[1:])
     _offsets(counts, starts, first_slots)
     entries = np.empty((int(starts[-1]), 2), np.int32)
-    _fill(packed, width, height, counts, first_slots, entries)
+    _fill(packed, width, height, open_tiles, counts, first_slots, entries)
     return packed, starts, entries, first_slots

@@ -33,7 +33,7 @@ def _count(packed, starts, entries, width, height, mask, slots):
                     inside[p] = mask[y0 + y, x0 + x] if there else ZERO
             for k in range(starts[tile], starts[tile + 1]):
                 j, slot = entries[k, 0], entries[k, 1]
-                start, stop = _rows(packed, j, y0)
+                start, stop = _rows(packed, j, y0, y0, y0 + TILE_H)
                 _draw(s, start, stop, packed, j, f32(1))
                 votes, pixels = ZERO, ZERO
                 for p in range(start, stop):
