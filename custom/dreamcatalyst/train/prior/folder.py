@@ -50,12 +50,12 @@ pipeline_tag: image-to-image
 
 {megabytes:.1f} MB: an AutoencoderKL, a CLIP text encoder and a U-Net on latents, for images of {size} x {size} pixels,
 trained from nothing on {pairs:,} pairs by `python launch.py --config configs/prior.yaml`.
-It knows small made worlds (bear statues, balls, boxes, plants on open ground or in rooms) and these edits of them, each
-in several wordings (`instructions.json`):
+It knows pictures of the kind that its pairs show (below) and these edits of them, each in several wordings
+(`instructions.json`):
 
 {edits}.
 
-Photographs, other objects and other instructions are beyond it.
+Other things and other instructions are beyond it.
 
 Trained: autoencoder {autoencoder:,} steps, text encoder and U-Net {unet:,} steps. Scheduler: {scheduler}.
 
