@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -113,6 +114,7 @@ class Guidance:
         self.source_text = self.prior.embed([compared])[0] if compared else None
         self.edits = EditedViews(config.per_editing_step, config.edit_min_percent, config.edit_max_percent, config.seed)
         self._views = ByteCache(VIEW_BYTES)
+        self.stage: Callable[[str], AbstractContextManager] = nullcontext  # around "encode" and "unet": for a clock
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -154,27 +156,29 @@ class Guidance:
         """
         if self.rule.delivers != "gradient":
             return self._compare(rgb, sources, index, step)
-        x_src, condition = self._sources(sources, index)
-        x = self.prior.encode(rgb.permute(0, 3, 1, 2))
+        with self.stage("encode"):
+            x_src, condition = self._sources(sources, index)
+            x = self.prior.encode(rgb.permute(0, 3, 1, 2))
         timestep = self.schedule.timestep(step, max_steps, self.prior.alphas_cumprod)
         noise, latents = self._step_noise(x, index, step, visits), x.detach()
         twice = len(noise) // len(latents) == 2
         if twice:
             latents, condition = torch.cat([latents, latents]), self.prior.stack([condition, condition])
             x_src = None if x_src is None else torch.cat([x_src, x_src])
-        gradient = distillation_gradient(
-            self.prior,
-            self.rule,
-            latents,
-            x_src,
-            image=condition,
-            text=self.text,
-            source_text=self.source_text,
-            timestep=timestep,
-            noise=noise,
-            guidance_scale=self.config.guidance_scale,
-            image_guidance_scale=self.config.condition_scale,
-        )
+        with self.stage("unet"):
+            gradient = distillation_gradient(
+                self.prior,
+                self.rule,
+                latents,
+                x_src,
+                image=condition,
+                text=self.text,
+                source_text=self.source_text,
+                timestep=timestep,
+                noise=noise,
+                guidance_scale=self.config.guidance_scale,
+                image_guidance_scale=self.config.condition_scale,
+            )
         if twice:
             gradient = (gradient[: len(x)] + gradient[len(x) :]) / 2
         return Step(distillation_loss(x, gradient, self.config.reduction), timestep, gradient)
@@ -210,7 +214,8 @@ class Guidance:
                 targets.append(self.known_edit(source, view))
                 continue
             if self.edits.due(view, step):
-                self.edits.put(view, self.edit(render, source, view, step))
+                with self.stage("unet"):
+                    self.edits.put(view, self.edit(render, source, view, step))
             targets.append(self.edits.get(view, like=rgb))
         target = torch.stack(targets)
         difference = rgb - target

@@ -19,13 +19,14 @@ from ..guidance.guidance import Guidance, GuidanceConfig
 from ..loss.anchor import AnchorConfig, anchor_loss, anchor_step
 from ..loss.perceptual import Lpips
 from ..render.api import Render
-from ..report.metrics import METRICS, psnr
+from ..report.metrics import psnr
 from ..report.pictures import write_png
 from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
 from ..scene.ply import read_ply, write_ply
 from ..segment.api import MaskConfig
 from .confine import confine, seen_mask
+from .finite import require_finite
 from .plan import Draft, describe_edit
 from .preview import PreviewConfig, preview_sheet
 from .system import SplatSystem
@@ -111,6 +112,8 @@ class EditSystem(SplatSystem):
         self.perceptual: Lpips | None = None
         self.generations = self.part["anchor"].generations()
         self._source_renders = ByteCache(self.cfg.source_cache_mib * 2**20)
+        self._references = ByteCache(self.cfg.source_cache_mib * 2**20)
+        self._regions: dict[int, Tensor | None] = {}
 
     def setup(self, stage: str) -> None:
         self.prepare()
@@ -127,6 +130,7 @@ class EditSystem(SplatSystem):
         if self.guidance is None:
             words: PromptConfig = self.part["prompt_processor"]
             self.guidance = Guidance(self.part["guidance"], words.prompt, words.source_prompt, device=self.root_device)
+            self.guidance.stage = self.clock.stage
             warn_of_unknown(self.guidance.prior.instructions, words.prompt)
         losses: LossConfig = self.part["loss"]
         if losses.lambda_perceptual and self.perceptual is None:
@@ -188,9 +192,10 @@ class EditSystem(SplatSystem):
     def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[Tensor, Render, dict[str, float]]:
         index, losses = batch["index"], self.part["loss"]
         render = self.draw_now(self.camera(index))
+        require_finite("render", colours=render.rgb)
         sources = torch.stack([self.source_render(i) for i in index])
         given = self.guidance.step(render.rgb, sources, index, step, self.max_steps, batch.get("visit"))
-        loss, numbers = losses.lambda_guidance * given.loss, {"t": given.timestep, "gradient": given.gradient_rms}
+        loss, numbers = losses.lambda_guidance * given.loss, {"t": given.timestep, "residual": given.gradient_rms}
         if self.perceptual is not None:
             distance = self.perceptual(render.rgb, given.target)
             loss, numbers["perceptual"] = loss + losses.lambda_perceptual * distance, float(distance.detach())
@@ -216,7 +221,20 @@ class EditSystem(SplatSystem):
         if self.generations is not None:
             self.generations.load_state_dict(checkpoint.get("generations", {"weights": []}), self.splats)
 
+    @property
+    def title(self) -> str:
+        return self.part["prompt_processor"].prompt
+
+    def timestep(self, step: int) -> int | None:
+        if self.guidance.rule.delivers != "gradient":
+            return None
+        return self.guidance.schedule.timestep(step, self.max_steps, self.guidance.prior.alphas_cumprod)
+
+    @torch.no_grad()
     def references(self, index: int) -> dict[str, Tensor]:
+        return self._references.get(index, lambda: self._make_references(index))
+
+    def _make_references(self, index: int) -> dict[str, Tensor]:
         source = self.source_render(index)
         if self.truth is not None:
             return {"truth": self.truth.image(self.draw, self.camera(index)), "source": source}
@@ -227,25 +245,15 @@ class EditSystem(SplatSystem):
         return {"edit": known, **({} if rest is None else {"fixed_point": rest}), "source": source}
 
     def region(self, index: int) -> Tensor | None:
-        """Where one view is meant to change, [H,W,1] of 0 and 1: the thing itself where the truth is known, else what
-        the mask lets change; None for an edit of everything."""
+        """The thing itself where the truth is known, else what the mask lets change; None for an edit of everything."""
         if self.truth is not None:
-            return self.truth.region(self.draw, self.camera(index))
+            if index not in self._regions:
+                self._regions[index] = self.truth.region(self.draw, self.camera(index))
+            return self._regions[index]
         return None if self.splats.frozen is None else seen_mask(self, index).round()
 
-    def score(self, index: int) -> dict[str, float]:
-        """As for every system; where only a part is meant to change, also inside of it against the edit, and outside
-        against the source."""
-        scores, region = super().score(index), self.region(index)
-        if region is None:
-            return scores
-        image, inside = self.picture(index)[None], region[None]
-        for name, reference in self.references(index).items():
-            where, weight = ("outside", 1 - inside) if name == "source" else ("inside", inside)
-            if bool(weight.any()):  # a view may show nothing of either
-                values = (image, reference.to(image)[None].clamp(0, 1), weight)
-                scores |= {f"{m}_{name}_{where}": float(METRICS.get(m)(*values)) for m in ("psnr", "ssim", "l1")}
-        return scores
+    def known_scenes(self) -> dict[str, Gaussians]:
+        return {"source": self.source, **({} if self.truth is None else {"truth": self.truth.scene})}
 
     def panels(self, index: int) -> list[tuple[str, Tensor]]:
         source, references = self.source_render(index), self.references(index)

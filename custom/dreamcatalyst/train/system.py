@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,37 +15,25 @@ from ..config import parse
 from ..data.camera import Cameras
 from ..data.views import Capture
 from ..diffusion.noise import keyed_generator
-from ..errors import ConfigError, NumericalError, SceneError
+from ..errors import ConfigError, NumericalError, SceneError, choose
 from ..render.api import Render, rasterize
 from ..render.frozen import Frozen
-from ..report.curve import Curve
-from ..report.metrics import METRICS
+from ..report.clip import ClipJudge
+from ..report.clock import Clock
+from ..report.metrics import compare
 from ..report.pictures import picture_row, write_png
 from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
 from ..scene.ply import read_ply, write_ply
-from . import results
+from . import results, scores, summary
 from .densify import STATISTICS, DensifyConfig, densify, observe, reset_opacity, screen_statistics
+from .finite import give_back, gradient_norms, kept_copy, leave_out, require_finite
 from .optim import LearningRates
 from .plan import Draft, Plan
+from .record import Record
+from .renderer import RendererConfig
 from .results import ReportConfig
-
-
-@dataclass(frozen=True)
-class RendererConfig:
-    """How splats are drawn."""
-
-    backend: str = "auto"  # reference | cpu | gsplat; auto: by the device
-    antialiased: bool = False  # Mip-Splatting's 2D filter
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0,1]
-    cache_mib: int = 1024  # what is kept of renders of splats that never change; the least recently used goes
-
-    def __post_init__(self) -> None:
-        if self.cache_mib < 0:
-            raise ConfigError(f"cache_mib: got {self.cache_mib}, expected 0 or more MiB.")
-        if not all(0 <= value <= 1 for value in self.background):
-            raise ConfigError(f"background: got {self.background}, expected red, green and blue in [0,1].")
 
 
 class SplatSystem(plugin.BaseSystem):
@@ -64,6 +51,7 @@ class SplatSystem(plugin.BaseSystem):
     class Config(plugin.BaseSystem.Config):
         gs_source: str = ""  # a PLY of splats to begin with
         drop_nonfinite: bool = False  # leave NaN and Inf rows of the PLY out, instead of refusing it
+        nonfinite: str = "stop"  # a step with a NaN or Inf ends the run, or is left out and counted: stop | skip
         seed: int = 0  # of everything that is drawn at random
         renderer: dict = field(default_factory=dict)
         learning_rates: dict = field(default_factory=dict)
@@ -82,6 +70,16 @@ class SplatSystem(plugin.BaseSystem):
 
     def references(self, index: int) -> dict[str, Tensor]:
         """What the render of a view is compared with, by name: [H,W,3] each, the first one being the aim."""
+        return {}
+
+    def region(self, index: int) -> Tensor | None:
+        """Where a view is meant to change, [H,W,1] of 0 and 1; None: everywhere."""
+
+    def timestep(self, step: int) -> int | None:
+        """The prior's timestep at `step`, None where there is none."""
+
+    def known_scenes(self) -> dict[str, Gaussians]:
+        """Further scenes, by name, with which the splats' consistency between views is compared."""
         return {}
 
     def make_splats(self, scene: Gaussians) -> Splats:
@@ -103,14 +101,16 @@ class SplatSystem(plugin.BaseSystem):
         self.generations: Generations | None = None  # of hierarchical splats, where a subclass keeps them
         self._frozen: tuple[Gaussians | None, Frozen | None] = None, None
         self._data: Any = None  # a data module, where there is no trainer to ask for it
-        self.curve, self._seconds, self._started = Curve(), 0.0, None
-        self._numbers: dict[str, float] = {}
+        choose("choice", self.cfg.nonfinite, ("stop", "skip"), "system.nonfinite")
+        self.record, self.plan_text = Record(self.part["report"]), ""
+        self.judge: ClipJudge | None = None
         self._outcomes: dict[int, dict[str, float]] = {}
 
     def setup(self, stage: str) -> None:
         if self.splats is None:
             self.splats = self.make_splats(self.first_scene().to(self.root_device))
             self.splats.state.update(screen_statistics(self.splats))
+        self.judge = self.judge or self.part["report"].judge(self.root_device)
         _ = self.capture  # opened here, since after this Lightning asks for the loaders of any stage
 
     def given_scene(self) -> Gaussians:
@@ -147,14 +147,15 @@ class SplatSystem(plugin.BaseSystem):
     def draw(self, scene: Gaussians, cameras: Cameras, **options: Any) -> Render:
         """Render with this run's settings."""
         renderer: RendererConfig = self.part["renderer"]
-        return rasterize(
-            scene,
-            cameras,
-            background=scene.means.new_tensor(renderer.background),
-            antialiased=renderer.antialiased,
-            backend=renderer.backend,
-            **options,
-        )
+        with self.clock.stage("render"):
+            return rasterize(
+                scene,
+                cameras,
+                background=scene.means.new_tensor(renderer.background),
+                antialiased=renderer.antialiased,
+                backend=renderer.backend,
+                **options,
+            )
 
     @property
     def frozen(self) -> Frozen | None:
@@ -200,42 +201,56 @@ class SplatSystem(plugin.BaseSystem):
     def on_train_start(self) -> None:
         plan = self.plan()
         plan.write(self.report_dir / "plan.json")
-        plugin.info(plan.text())
-        self._started = time.perf_counter()
-        if self.true_global_step == 0:
-            self.report_row(0)
+        self.plan_text = plan.text()
+        plugin.info(self.plan_text)
+        if self.cfg.nonfinite == "skip" and self._scaler is not None:
+            raise ConfigError("system.nonfinite=skip: mixed precision with a loss scale skips by itself; leave it out.")
+        self.record.begin(self)
 
     @property
-    def seconds(self) -> float:
-        """Time spent in training so far, reports left out."""
-        return self._seconds + (time.perf_counter() - self._started if self._started is not None else 0.0)
+    def clock(self) -> Clock:
+        """Time spent in training so far, by stage."""
+        return self.record.clock
+
+    @property
+    def _scaler(self) -> Any:
+        """Of mixed precision in fp16: it scales the loss, and leaves out steps that overflow."""
+        return getattr(self.trainer.strategy.precision_plugin, "scaler", None)
 
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
-        step, optimizer = self.true_global_step, self.optimizers()
-        rates = self.rates(step)
+        step = self.true_global_step
+        try:
+            self.record.numbers = self._step(batch, step)
+        except NumericalError as error:
+            leave_out(self, error, batch, step)
+        with self.clock.stage("densify"):
+            self._density_control(step + 1)
+
+    def _step(self, batch: Mapping[str, Any], step: int) -> dict[str, float]:
+        """One update of the splats, and its numbers. Raises NumericalError, and leaves the splats as they were."""
+        optimizer, rates, stage = self.optimizers(), self.rates(step), self.clock.stage
         for group in self.splats.optimizer.param_groups:
             group["lr"] = rates[group["name"]]
         loss, render, numbers = self.step_loss(batch, step)
-        if not torch.isfinite(loss):
-            raise self._not_finite(f"the loss is {float(loss.detach())}", step, batch)
+        require_finite("render", colours=render.rgb)
+        require_finite("loss", loss=loss)
         render.means2d.retain_grad()
         optimizer.zero_grad()
-        self.manual_backward(loss)
-        scaler = getattr(self.trainer.strategy.precision_plugin, "scaler", None)
-        observe(self.splats, render, 1.0 if scaler is None else float(scaler.get_scale()))
-        if scaler is None:  # else it looks itself, and leaves out steps that overflow
-            for name, value in self.splats.parameters.items():
-                if value.grad is not None and not torch.isfinite(value.grad.sum()):
-                    raise self._not_finite(f"the gradient of {name} is not finite", step, batch)
-        with self.splats.scaled_update():
-            optimizer.step()
-            self.after_update()
-        self._density_control(step + 1)
-        self._numbers = {"loss": float(loss.detach()), **numbers}
-
-    def _not_finite(self, what: str, step: int, batch: Mapping[str, Any]) -> NumericalError:
-        views = ", ".join(self.capture.views[i].name for i in batch["index"])
-        return NumericalError(f"step {step}, view {views}: {what}. The splats are those of the step before.")
+        with stage("backward"):
+            self.manual_backward(loss)
+            norms = {} if self._scaler is not None else gradient_norms(self.splats.parameters)
+        observe(self.splats, render, 1.0 if self._scaler is None else float(self._scaler.get_scale()))
+        with stage("optimizer"):
+            kept = kept_copy(self.splats.parameters)
+            with self.splats.scaled_update():
+                optimizer.step()
+                self.after_update()
+            try:
+                require_finite("optimizer", **self.splats.parameters)
+            except NumericalError:
+                give_back(self.splats.parameters, kept)
+                raise
+        return {"loss": float(loss.detach()), **numbers, **{f"norm_{name}": norm for name, norm in norms.items()}}
 
     def _density_control(self, step: int) -> None:
         config: DensifyConfig = self.part["densify"]
@@ -247,47 +262,34 @@ class SplatSystem(plugin.BaseSystem):
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
-        step, every = self.true_global_step, self.part["report"].every
-        if step >= self.max_steps or (every and step % every == 0):
-            self.report_row(step)
+        if self.record.wanted(self.true_global_step, self.max_steps):
+            self.record.add(self, self.true_global_step)
 
     def on_train_end(self) -> None:
-        self._pause()
+        self.clock.stop()
         if self.true_global_step < self.max_steps:  # ended by something else, such as trainer.max_time
             self.save_now()
         else:
             self.write_splats("last.ply")  # before any test can fail
 
-    def _pause(self) -> None:
-        if self._started is not None:
-            self._seconds, self._started = self.seconds, None
+    @property
+    def title(self) -> str:
+        """What the run is about, for its report."""
+        return "Splats from photographs"
 
     def progress_metrics(self) -> dict[str, float]:
         """What the progress bar shows besides step and speed."""
-        known = {"loss": self._numbers["loss"]} if "loss" in self._numbers else {}
-        return {**known, "splats": self.splats.total}
+        known = {"loss": self.record.numbers["loss"]} if "loss" in self.record.numbers else {}
+        skipped = {"skipped": self.record.skipped} if self.record.skipped else {}
+        return {**known, "splats": self.splats.total, **skipped}
 
     # --- measuring
 
-    def score(self, index: int) -> dict[str, float]:
-        """Every metric of one view against each of its references, as "<metric>_<reference>"."""
-        image = self.picture(index)[None]
-        return {
-            f"{metric}_{name}": float(METRICS.get(metric)(image, reference.to(image)[None].clamp(0, 1)))
-            for name, reference in self.references(index).items()
-            for metric in ("psnr", "ssim", "l1")
-        }
-
-    def report_row(self, step: int) -> None:
-        """Measure some held-out views and add a row to the error curve; the clock stands still meanwhile."""
-        running, seconds = self._started is not None, self.seconds
-        self._pause()
-        held_out = self.data.held_out
-        chosen = held_out[:: max(1, len(held_out) // max(self.part["report"].views, 1))][: self.part["report"].views]
-        row = {"step": step, "seconds": round(seconds, 3), "splats": self.splats.total, **self._numbers}
-        self.curve.add(**row, **results.mean_scores([self.score(i) for i in chosen]))
-        if running:
-            self._started = time.perf_counter()
+    def score(self, index: int, image: Tensor | None = None) -> dict[str, float]:
+        """Every metric of one view against each of its references (`report.metrics.compare`). image: the picture of
+        the view, where it is there already."""
+        image = self.picture(index) if image is None else image
+        return compare(image, self.references(index), self.region(index))
 
     def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
         for index in batch["index"]:
@@ -295,8 +297,8 @@ class SplatSystem(plugin.BaseSystem):
             write_png(self.save_path(f"it{self.true_global_step}-{index}.png"), picture_row(self.panels(index)))
 
     def on_validation_epoch_end(self) -> None:
-        results.print_scores(self._outcomes, self.capture)
-        results.log_scores(self, self._outcomes, "val")
+        scores.print_scores(self._outcomes, self.capture)
+        scores.log_scores(self, self._outcomes, "val")
         self._outcomes = {}
 
     def test_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
@@ -345,11 +347,11 @@ class SplatSystem(plugin.BaseSystem):
         """Keep the state of the moment (after an interruption): a checkpoint to resume from, and the PLY."""
         checkpoint = Path(self.get_save_dir()).parent / "ckpts" / "last.ckpt"
         self.trainer.save_checkpoint(checkpoint)
-        return [checkpoint, self.write_splats("last.ply")]
+        return [checkpoint, self.write_splats("last.ply"), *summary.write_report(self, {})]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["splats"] = self.splats.state_dict()
-        checkpoint["run"] = {"system": type(self).__name__, "seconds": self.seconds, "curve": self.curve.rows}
+        checkpoint["run"] = {"system": type(self).__name__, **self.record.state_dict()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if "splats" not in checkpoint:
@@ -362,4 +364,4 @@ class SplatSystem(plugin.BaseSystem):
         missing = [name for name in STATISTICS if name not in self.splats.state]
         if missing:
             raise SceneError(f"resume: the checkpoint lacks the per-splat state {', '.join(missing)}.")
-        self._seconds, self.curve = checkpoint["run"]["seconds"], Curve(checkpoint["run"]["curve"])
+        self.record.load_state_dict(checkpoint["run"])

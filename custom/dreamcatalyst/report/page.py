@@ -1,0 +1,166 @@
+"""A run on one page: an HTML file that needs no other, and no network."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from .pictures import to_uint8
+
+STYLE = """
+:root{--bg:#f6f5f2;--card:#fff;--ink:#1d1f23;--soft:#6b6f76;--line:#e3e1dc;--accent:#b4552d;
+--c0:#b4552d;--c1:#2f6f9f;--c2:#4d8a4a;--c3:#8a5aa8;--c4:#b08a1e;--c5:#5b6470}
+@media(prefers-color-scheme:dark){:root{--bg:#16181c;--card:#1f2227;--ink:#e8e6e1;--soft:#9a9ea6;--line:#32363d;
+--accent:#e08a5f;--c0:#e08a5f;--c1:#74b0dc;--c2:#86c282;--c3:#c49be0;--c4:#dcb95a;--c5:#a9b1bc}}
+*{box-sizing:border-box}
+body{margin:0;background:var(--bg);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
+main{max-width:1080px;margin:0 auto;padding:36px 20px 60px}
+h1{font-size:30px;line-height:1.2;margin:0 0 4px}h2{font-size:18px;margin:36px 0 12px}
+.sub{color:var(--soft);margin:0 0 22px}
+.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(158px,1fr));gap:12px}
+.tile,.card,figure{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:12px 14px;margin:0}
+.tile b{display:block;font-size:24px;line-height:1.25;font-variant-numeric:tabular-nums}
+.tile span{color:var(--soft);font-size:13px}
+.charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(330px,1fr));gap:12px}
+figcaption{font-weight:600;font-size:14px;display:flex;justify-content:space-between;gap:10px;flex-wrap:wrap}
+figcaption span{font-weight:400;font-size:12px;margin-left:10px;color:var(--soft)}
+figcaption span::before{content:"";display:inline-block;width:10px;height:10px;border-radius:5px;margin-right:4px;
+background:var(--c)}
+svg{width:100%;height:auto;display:block}svg text{fill:var(--soft);font-size:11px}
+svg .grid{stroke:var(--line)}svg polyline{fill:none;stroke:var(--c);stroke-width:1.8;stroke-linejoin:round}
+svg circle{fill:var(--c)}
+.c0{--c:var(--c0)}.c1{--c:var(--c1)}.c2{--c:var(--c2)}.c3{--c:var(--c3)}.c4{--c:var(--c4)}.c5{--c:var(--c5)}
+.c6{--c:#9aa}.c7{--c:#ccb}
+.slide{position:relative;overflow:hidden;border-radius:10px;max-width:640px;line-height:0;margin:0 auto}
+.slide img{width:100%;display:block}.slide .top{position:absolute;inset:0;clip-path:inset(0 50% 0 0)}
+.slide i{position:absolute;top:0;bottom:0;left:50%;width:2px;background:#fff;box-shadow:0 0 5px #0008}
+.slide input{position:absolute;inset:0;width:100%;height:100%;opacity:0;margin:0;cursor:ew-resize}
+.slide span{position:absolute;bottom:8px;padding:3px 8px;border-radius:6px;background:#000a;color:#fff;font-size:12px;
+line-height:1.3}.slide span:nth-of-type(1){left:8px}.slide span:nth-of-type(2){right:8px}
+.views{display:grid;gap:10px;margin-top:12px}
+.row{display:grid;grid-auto-flow:column;grid-auto-columns:1fr;gap:8px}
+.row div{font-size:12px;color:var(--soft)}.row img{width:100%;display:block;border-radius:6px}
+.bar{display:flex;height:22px;border-radius:6px;overflow:hidden;margin:6px 0 10px}.bar div{background:var(--c)}
+.keys span{display:inline-block;margin-right:16px;font-size:13px;color:var(--soft)}
+.keys span::before{content:"";display:inline-block;width:10px;height:10px;border-radius:2px;margin-right:5px;
+background:var(--c)}
+.scroll{overflow-x:auto}table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:13px}
+th,td{padding:5px 10px;border-bottom:1px solid var(--line);text-align:right;white-space:nowrap}
+th:first-child,td:first-child{text-align:left}thead th{color:var(--soft);font-weight:500}
+tr:last-child td{border-bottom:0}tr.mean td{font-weight:600}
+details{margin-top:10px}summary{cursor:pointer;font-weight:600}
+pre{white-space:pre-wrap;overflow-wrap:anywhere;font:12px/1.5 ui-monospace,Menlo,Consolas,monospace;margin:10px 0 0}
+"""
+SCRIPT = """
+document.querySelectorAll('.slide').forEach(s=>{const r=s.querySelector('input');r.oninput=()=>{
+s.querySelector('.top').style.clipPath=`inset(0 ${100-r.value}% 0 0)`;s.querySelector('i').style.left=r.value+'%'}})
+"""
+COLOURS = 8
+
+
+@dataclass(frozen=True)
+class Table:
+    """columns: the first one names the rows. A row whose first cell is "mean" stands out."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Page:
+    """What stands on a page, from top to bottom. tiles: label to value. pictures: a row of labelled pictures [H,W,3] in
+    [0,1] for each view, of which the first two are before and after. charts: figures of `chart.line_chart`.
+    stages: seconds by stage. texts: headings to what stands below them, folded up."""
+
+    title: str
+    subtitle: str
+    tiles: Mapping[str, str] = field(default_factory=dict)
+    pictures: Sequence[Sequence[tuple[str, Tensor]]] = ()
+    charts: Sequence[str] = ()
+    stages: Mapping[str, float] = field(default_factory=dict)
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+
+    def html(self) -> str:
+        """The whole file."""
+        body = [f"<h1>{escape(self.title)}</h1>", f'<p class="sub">{escape(self.subtitle)}</p>', _tiles(self.tiles)]
+        body += [_pictures(self.pictures)] if self.pictures else []
+        if charts := [chart for chart in self.charts if chart]:
+            body.append(f'<h2>Against run time</h2><div class="charts">{"".join(charts)}</div>')
+        body += [_stages(self.stages)] if sum(self.stages.values()) > 0 else []
+        body += [f"<h2>{escape(name)}</h2>{_table(table)}" for name, table in self.tables.items()]
+        folded = (
+            f'<details class="card"><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>'
+            for name, text in self.texts.items()
+        )
+        return (
+            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width,initial-scale=1">'
+            f"<title>{escape(self.title)}</title><style>{STYLE}</style></head>\n"
+            f"<body><main>{''.join([*body, *folded])}</main><script>{SCRIPT}</script></body></html>\n"
+        )
+
+    def write(self, path: Path) -> Path:
+        """Write the file."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.html(), encoding="utf-8")
+        return path
+
+
+def data_uri(image: Tensor, quality: int = 90) -> str:
+    """A picture [H,W,3] in [0,1] as a JPEG inside an address."""
+    _, encoded = cv2.imencode(
+        ".jpg", np.ascontiguousarray(to_uint8(image)[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+
+
+def _tiles(tiles: Mapping[str, str]) -> str:
+    cells = (f'<div class="tile"><b>{escape(v)}</b><span>{escape(k)}</span></div>' for k, v in tiles.items())
+    return f'<div class="tiles">{"".join(cells)}</div>'
+
+
+def _pictures(rows: Sequence[Sequence[tuple[str, Tensor]]]) -> str:
+    """A slider between before and after of the first view, then all of every view."""
+    shown = [[(label, data_uri(image)) for label, image in row] for row in rows]
+    out = ["<h2>Before and after</h2>"]
+    if len(shown[0]) > 1:
+        (before, first), (after, second) = shown[0][:2]
+        out.append(
+            f'<div class="slide"><img src="{second}" alt=""><img class="top" src="{first}" alt=""><i></i>'
+            f"<span>{escape(before)}</span><span>{escape(after)}</span>"
+            '<input type="range" min="0" max="100" value="50" aria-label="before and after"></div>'
+        )
+    out.append('<div class="views">')
+    for row in shown:
+        cells = (f'<div><img src="{uri}" alt="{escape(label)}">{escape(label)}</div>' for label, uri in row)
+        out.append(f'<div class="row">{"".join(cells)}</div>')
+    return "".join([*out, "</div>"])
+
+
+def _stages(stages: Mapping[str, float]) -> str:
+    """A bar that is divided as the run's time is."""
+    total = sum(stages.values())
+    parts = [(n % COLOURS, name, value) for n, (name, value) in enumerate(stages.items()) if value > 0]
+    bar = "".join(
+        f'<div class="c{n}" style="width:{100 * v / total:.2f}%" title="{escape(k)}"></div>' for n, k, v in parts
+    )
+    keys = (f'<span class="c{n}">{escape(k)} {v:.1f} s, {100 * v / total:.1f} %</span>' for n, k, v in parts)
+    bar = f'<div class="bar">{bar}</div><div class="keys">{"".join(keys)}</div>'
+    return f'<h2>Where the time went</h2><div class="card">{bar}</div>'
+
+
+def _table(table: Table) -> str:
+    head = "".join(f"<th>{escape(name)}</th>" for name in table.columns)
+    rows = "".join(
+        f"<tr{' class=mean' if row[0] == 'mean' else ''}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
+        for row in table.rows
+    )
+    return f'<div class="card scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'

@@ -1,0 +1,89 @@
+"""What a run says of itself while it goes: a row of numbers each so many steps, within a share of the run's time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ..report.clock import LOGGING, OTHER, Clock
+from ..report.curve import Curve
+from ..report.machine import peak_memory, waiter
+from .results import ReportConfig
+from .scores import mean_scores
+
+if TYPE_CHECKING:
+    from .system import SplatSystem
+
+
+class Record:
+    """The rows of `curve`. Each holds what costs nothing: step, seconds in all (without reports) and by stage, both
+    since the start; splats, memory, and the numbers of the step. Errors at held-out views are measured in the first
+    row, in the last, and in those between as long as reports stay within `report.overhead` of the run's time."""
+
+    def __init__(self, config: ReportConfig):
+        self.config, self.clock, self.curve = config, Clock(), Curve()
+        self.numbers: dict[str, float] = {}  # of the latest step
+        self.skipped = 0  # steps that were left out because something in them was not finite
+        self._cost = 0.0  # seconds of the latest measurement
+        self._seen: tuple[float, dict[int, Tensor]] | None = None  # the seconds and the pictures of it
+
+    def begin(self, system: SplatSystem) -> None:
+        """Start the clock, and of a new run, add the row of step 0."""
+        system.picture(self.views(system)[0])  # the first picture may compile the renderer: no part of any run
+        self.clock.wait = waiter(system.root_device) if self.config.synchronize else None
+        self.clock.start()
+        if system.true_global_step == 0:
+            self.add(system, 0)
+
+    def views(self, system: SplatSystem) -> list[int]:
+        """The held-out views that are measured along the way."""
+        held_out, count = system.data.held_out, self.config.views
+        return held_out[:: max(1, len(held_out) // count)][:count]
+
+    def wanted(self, step: int, last: int) -> bool:
+        """Whether `step` has a row."""
+        return step >= last or bool(self.config.every and step % self.config.every == 0)
+
+    def add(self, system: SplatSystem, step: int) -> None:
+        """Add the row of `step`; it takes the place of an earlier one of the same step."""
+        clock = self.clock
+        with clock.stage(LOGGING):
+            row = {"step": step, "seconds": round(clock.seconds, 3), "splats": system.splats.total}
+            row |= {f"seconds_{name}": round(value, 3) for name, value in clock.stages.items()}
+            memory = peak_memory(system.root_device)
+            row |= {} if memory is None else {"memory_mib": round(memory, 1)}
+            row |= {"skipped": self.skipped} if self.skipped else {}
+            bound = self.config.overhead * clock.seconds
+            measured = step == 0 or step >= system.max_steps or clock.reporting + self._cost <= bound
+            self.curve.add(**row, **self.numbers, **(self._errors(system) if measured else {}))
+            if measured:
+                self.curve.write_csv(system.report_dir / "error.csv")
+
+    def _errors(self, system: SplatSystem) -> dict[str, float]:
+        """Scores at the views of `views`, mean over them, and how fast the pictures change."""
+        began = time.perf_counter()
+        pictures = {index: system.picture(index) for index in self.views(system)}
+        errors = mean_scores([system.score(index, picture) for index, picture in pictures.items()])
+        if self._seen is not None and self.clock.seconds > self._seen[0]:
+            then, before = self._seen
+            moved = torch.stack([(pictures[index] - before[index]).abs().mean() for index in pictures]).mean()
+            errors["change_per_second"] = float(moved) / (self.clock.seconds - then)
+        self._seen = self.clock.seconds, pictures
+        self._cost = time.perf_counter() - began
+        return errors
+
+    # --- what a checkpoint keeps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Rows, clock and count."""
+        return {"curve": self.curve.rows, "stages": self.clock.state_dict(), "skipped": self.skipped}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from an earlier run's. One that kept no stages has its seconds in one piece."""
+        self.curve = Curve(state["curve"])
+        self.clock.load_state_dict(state["stages"] if "stages" in state else {OTHER: state["seconds"]})
+        self.skipped = state.get("skipped", 0)

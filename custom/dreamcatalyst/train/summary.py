@@ -1,0 +1,143 @@
+"""A run's report/ folder: the table and its plot, the summary, and everything on one page."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import OmegaConf
+
+from ..report.chart import line_chart
+from ..report.curve import Curve
+from ..report.machine import machine, versions
+from ..report.page import Page, Table
+from .scores import mean_scores
+
+if TYPE_CHECKING:
+    from .system import SplatSystem
+
+PICTURES = 4  # views on the page
+LABELS = {  # of the tiles, the best first, by score
+    "psnr_truth_inside": "PSNR to the truth, where it is edited, dB",
+    "psnr_truth": "PSNR to the truth, dB",
+    "psnr_edit_inside": "PSNR to the known edit, inside, dB",
+    "psnr_edit": "PSNR to the known edit, dB",
+    "psnr_photo": "PSNR to the photographs, dB",
+    "ssim_photo": "SSIM to the photographs",
+    "l1_source_outside": "drift outside of the mask, L1",
+    "l1_source": "identity distance: L1 to the source",
+    "consistency_short": "consistency of near views, RMSE",
+    "clip_direction": "CLIP direction",
+    "clip_similarity": "CLIP image similarity",
+    "aesthetic": "aesthetic score",
+}
+CHARTS = (  # title, how its columns begin, logarithmic
+    ("PSNR at held-out views, dB", "psnr_", False),
+    ("SSIM at held-out views", "ssim_", False),
+    ("L1 at held-out views", "l1_", True),
+    ("convergence: change of the pictures per second, L1", "change_per_second", True),
+    ("the rule's residual: root mean square of its gradient", "residual", True),
+    ("loss", "loss", True),
+    ("norms of the parameters' gradients", "norm_", True),
+    ("timestep", "t", False),
+    ("splats", "splats", False),
+)
+
+
+def plain(values: Mapping[str, float]) -> dict[str, float | None]:
+    """Numbers as JSON can have them: it knows no infinity."""
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]]) -> list[Path]:
+    """Write error.csv and error.png (where there was training), index.html and summary.json; return their folder.
+
+    The summary's "overhead" says what reports took: rows, this function, and the share of both in the whole.
+    """
+    began, folder, record = time.perf_counter(), system.report_dir, system.record
+    folder.mkdir(parents=True, exist_ok=True)
+    mean, seconds = mean_scores(list(scores.values())), record.clock.seconds
+    if record.curve.rows:
+        record.curve.write_csv(folder / "error.csv")
+        plot(record.curve, folder / "error.png")
+    summary = {
+        "step": system.true_global_step,
+        "seconds": round(seconds, 2),
+        "splats": system.splats.total,
+        "skipped": record.skipped,
+        "held_out": [system.capture.views[i].name for i in scores],
+        "mean": plain(mean),
+        "stages": {name: round(value, 3) for name, value in record.clock.stages.items()},
+        "machine": machine(system.root_device),
+        "versions": versions(),
+    }
+    make_page(system, summary, scores).write(folder / "index.html")
+    rows, files = record.clock.reporting, time.perf_counter() - began
+    share = (rows + files) / (seconds + rows + files)
+    summary["overhead"] = {"rows": round(rows, 3), "files": round(files, 3), "share": round(share, 4)}
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    return [folder]
+
+
+def plot(curve: Curve, path: Path) -> None:
+    """The errors against seconds, as a picture."""
+    groups = {}
+    for metric, unit in (("psnr", "PSNR, dB"), ("ssim", "SSIM")):
+        columns = [c for c in curve.columns if c.startswith(f"{metric}_")]
+        groups |= {f"{unit}, held-out views": columns} if columns else {}
+    if groups:
+        curve.plot(path, groups)
+
+
+def charts(curve: Curve) -> Iterable[str]:
+    """Everything that the rows tell, against seconds, as figures of a page."""
+    for title, start, log in CHARTS:
+        columns = [c for c in curve.columns if c.startswith(start) and (start.endswith("_") or c == start)]
+        series = {c.removeprefix(start) or c: [(r["seconds"], r[c]) for r in curve.rows if c in r] for c in columns}
+        if start == "splats" and len({row[start] for row in curve.rows}) == 1:
+            continue
+        yield line_chart(title, series, log=log)
+
+
+def score_rows(names: Sequence[str], scores: Sequence[Mapping[str, float]]) -> Table:
+    """One row for each view and one for the mean."""
+    columns = list(mean_scores(scores))
+    rows = [*zip(names, scores, strict=True), ("mean", mean_scores(scores))]
+    cells = [[name, *(f"{row[c]:.4g}" if c in row else "" for c in columns)] for name, row in rows]
+    return Table(["view", *(c.replace("_", " ") for c in columns)], cells)
+
+
+def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mapping[str, float]]) -> Page:
+    """The page of a run."""
+    mean, views = mean_scores(list(scores.values())), system.capture.views
+    tiles = {LABELS[name]: f"{mean[name]:.4g}" for name in LABELS if name in mean}
+    tiles |= {"steps": f"{summary['step']:,}", "seconds in training": f"{summary['seconds']:,.1f}"}
+    tiles |= {"splats": f"{summary['splats']:,}"} | (
+        {"steps left out": f"{system.record.skipped}"} if system.record.skipped else {}
+    )
+    shown = list(scores)[:: max(1, len(scores) // PICTURES)][:PICTURES]
+    given = {
+        name: "\n".join(f"{key}: {value}" for key, value in summary[name].items()) for name in ("machine", "versions")
+    }
+    plan = system.report_dir / "plan.json"
+    texts = {"The plan": system.plan_text} if plan.is_file() and system.plan_text else {}
+    return Page(
+        title=system.title,
+        subtitle=f"{system.report_dir.parent.name} · {system.capture.source} · {summary['machine']['processor']}",
+        tiles=tiles,
+        pictures=[system.panels(index) for index in shown],
+        charts=list(charts(system.record.curve)),
+        stages=summary["stages"],
+        tables={"Held-out views": score_rows([views[i].name for i in scores], list(scores.values()))} if scores else {},
+        texts={**texts, "Config": config_text(system), "Machine": given["machine"], "Versions": given["versions"]},
+    )
+
+
+def config_text(system: SplatSystem) -> str:
+    """What made the run: the whole config where the launcher left it beside the report, else the system's own."""
+    whole = system.report_dir.parent / "configs" / "parsed.yaml"
+    return whole.read_text(encoding="utf-8") if whole.is_file() else OmegaConf.to_yaml(system.cfg)
