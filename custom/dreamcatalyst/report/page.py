@@ -91,10 +91,12 @@ class Page:
     def html(self) -> str:
         """The whole file."""
         body = [f"<h1>{escape(self.title)}</h1>", f'<p class="sub">{escape(self.subtitle)}</p>', _tiles(self.tiles)]
-        body += [_pictures(self.pictures)] if self.pictures else []
+        shown = [[(label, data_uri(image)) for label, image in row] for row in self.pictures]
+        body += [_slider(shown[0])] if shown and len(shown[0]) > 1 else []
         if charts := [chart for chart in self.charts if chart]:
             body.append(f'<h2>Against run time</h2><div class="charts">{"".join(charts)}</div>')
         body += [_stages(self.stages)] if sum(self.stages.values()) > 0 else []
+        body += [_views(shown)] if shown else []
         body += [f"<h2>{escape(name)}</h2>{_table(table)}" for name, table in self.tables.items()]
         folded = (
             f'<details class="card"><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>'
@@ -127,19 +129,20 @@ def _tiles(tiles: Mapping[str, str]) -> str:
     return f'<div class="tiles">{"".join(cells)}</div>'
 
 
-def _pictures(rows: Sequence[Sequence[tuple[str, Tensor]]]) -> str:
-    """A slider between before and after of the first view, then all of every view."""
-    shown = [[(label, data_uri(image)) for label, image in row] for row in rows]
-    out = ["<h2>Before and after</h2>"]
-    if len(shown[0]) > 1:
-        (before, first), (after, second) = shown[0][:2]
-        out.append(
-            f'<div class="slide"><img src="{second}" alt=""><img class="top" src="{first}" alt=""><i></i>'
-            f"<span>{escape(before)}</span><span>{escape(after)}</span>"
-            '<input type="range" min="0" max="100" value="50" aria-label="before and after"></div>'
-        )
-    out.append('<div class="views">')
-    for row in shown:
+def _slider(row: Sequence[tuple[str, str]]) -> str:
+    """Before and after of one view, one over the other."""
+    (before, first), (after, second) = row[:2]
+    return (
+        f'<h2>Before and after</h2><div class="slide"><img src="{second}" alt=""><img class="top" src="{first}" alt="">'
+        f"<i></i><span>{escape(before)}</span><span>{escape(after)}</span>"
+        '<input type="range" min="0" max="100" value="50" aria-label="before and after"></div>'
+    )
+
+
+def _views(rows: Sequence[Sequence[tuple[str, str]]]) -> str:
+    """All pictures of every view."""
+    out = ['<h2>Held-out views</h2><div class="views">']
+    for row in rows:
         cells = (f'<div><img src="{uri}" alt="{escape(label)}">{escape(label)}</div>' for label, uri in row)
         out.append(f'<div class="row">{"".join(cells)}</div>')
     return "".join([*out, "</div>"])

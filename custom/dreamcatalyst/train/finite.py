@@ -26,13 +26,13 @@ def require_finite(stage: str, **tensors: Tensor) -> None:
 
 
 def gradient_norms(parameters: Mapping[str, Tensor]) -> dict[str, float]:
-    """The Euclidean norm of each parameter's gradient, by name; 0 where there is none.
+    """The Euclidean norm of the gradient of each parameter that has elements, by name; 0 where there is no gradient.
 
     Raises NumericalError for a gradient that is not finite, and for one whose square is not: Adam's second moment
     would be infinite from then on, and the parameter stand still for good, without a word.
     """
     given = {name: value.grad for name, value in parameters.items() if value.grad is not None and value.numel()}
-    norms = dict.fromkeys(parameters, 0.0)
+    norms = {name: 0.0 for name, value in parameters.items() if value.numel()}
     if given:
         found = torch.stack(torch._foreach_norm(list(given.values()))).tolist()  # waits for the device once
         norms |= dict(zip(given, found, strict=True))

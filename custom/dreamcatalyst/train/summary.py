@@ -113,7 +113,7 @@ def score_rows(names: Sequence[str], scores: Sequence[Mapping[str, float]]) -> T
 
 def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mapping[str, float]]) -> Page:
     """The page of a run."""
-    mean, views = mean_scores(list(scores.values())), system.capture.views
+    mean, views, folder = mean_scores(list(scores.values())), system.capture.views, system.report_dir.parent
     tiles = {LABELS[name]: f"{mean[name]:.4g}" for name in LABELS if name in mean}
     tiles |= {"steps": f"{summary['step']:,}", "seconds in training": f"{summary['seconds']:,.1f}"}
     tiles |= {"splats": f"{summary['splats']:,}"} | (
@@ -127,12 +127,12 @@ def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mappin
     texts = {"The plan": system.plan_text} if plan.is_file() and system.plan_text else {}
     return Page(
         title=system.title,
-        subtitle=f"{system.report_dir.parent.name} · {system.capture.source} · {summary['machine']['processor']}",
+        subtitle=f"{folder.parent.name}/{folder.name} · {system.capture.source} · {summary['machine']['processor']}",
         tiles=tiles,
         pictures=[system.panels(index) for index in shown],
         charts=list(charts(system.record.curve)),
         stages=summary["stages"],
-        tables={"Held-out views": score_rows([views[i].name for i in scores], list(scores.values()))} if scores else {},
+        tables={"Scores": score_rows([views[i].name for i in scores], list(scores.values()))} if scores else {},
         texts={**texts, "Config": config_text(system), "Machine": given["machine"], "Versions": given["versions"]},
     )
 
