@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -70,10 +71,26 @@ def predict_difference(prior: Prior, edit: Branch, reference: Branch | None, tim
     latents are.
     """
     rows = difference_rows(edit, reference, prior.takes_image)
-    ours = torch.zeros_like(edit.noisy, dtype=torch.promote_types(edit.noisy.dtype, torch.float32))
-    theirs = torch.zeros_like(ours)  # summed apart, in the same order: equal branches then cancel to the bit
+    total = torch.zeros_like(edit.noisy, dtype=torch.promote_types(edit.noisy.dtype, torch.float32))
     predictions = prior.predict_noise([row for row, _ in rows], timestep) if rows else []
-    for (row, coefficient), prediction in zip(rows, predictions, strict=True):
-        side = ours if row.noisy is edit.noisy else theirs
-        side.add_(prediction.to(side.dtype), alpha=coefficient)
-    return ours + theirs
+    # Summed branch by branch, in the same order: equal branches then cancel to the bit.
+    for ours in (True, False):
+        parts = [
+            (prediction.to(total.dtype), coefficient)
+            for (row, coefficient), prediction in zip(rows, predictions, strict=True)
+            if (row.noisy is edit.noisy) == ours
+        ]
+        if parts:
+            total += _weighted_sum(parts)
+    return total
+
+
+def _weighted_sum(parts: list[tuple[Tensor, float]]) -> Tensor:
+    """sum c_i p_i as c_1 (p_1 - p_2) + (c_1 + c_2) (p_2 - p_3) + ... + (c_1 + ... + c_n) p_n: of a branch, w_y times
+    what the text changes, w_I times what the image changes, and the null prediction. The c_i themselves grow with w_y
+    and cancel, which would cost the digits that a large guidance scale amplifies."""
+    sums = list(accumulate(coefficient for _, coefficient in parts))
+    total = parts[-1][0] * sums[-1]
+    for (prediction, _), (after, _), coefficient in zip(parts, parts[1:], sums, strict=False):
+        total.add_(prediction - after, alpha=coefficient)
+    return total

@@ -28,6 +28,18 @@ def abar_at(alphas_cumprod: Tensor, timestep: int) -> float:
     return float(alphas_cumprod[timestep])
 
 
+def signal_at(alphas_cumprod: Tensor, timestep: int) -> float:
+    """As `abar_at`, for those who divide by it. Raises PriorError where it is 0: with zero terminal SNR (Lin et al.
+    2024), the last noisy latents hold nothing of the image, and a noise prediction says nothing about it."""
+    abar = abar_at(alphas_cumprod, timestep)
+    if abar <= 0.0:
+        raise PriorError(
+            f"timestep {timestep} of the prior's schedule holds no signal (abar = 0: zero terminal SNR), so that a "
+            "noise prediction does not tell the image. Stay below it: lower max_step_percent (or edit_max_percent)"
+        )
+    return abar
+
+
 def add_noise(latents: Tensor, noise: Tensor, abar: float) -> Tensor:
     """x_t = sqrt(abar) x_0 + sqrt(1 - abar) eps (Ho et al. 2020, equation 4), all of one shape."""
     return abar**0.5 * latents + (1.0 - abar) ** 0.5 * noise

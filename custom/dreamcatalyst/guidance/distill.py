@@ -34,14 +34,17 @@ def distillation_gradient(
     x, x_src [B,C,h,w]: latents of the edited and of the source render (x_src may be None for a rule without source).
     image: `prior.condition` of the source; text, source_text: from `prior.embed`, None for the null instruction
     (source_text is used by dds and pds). timestep: index 0..T-1. noise: as x, the same for both branches.
-    The result is float32, float64 where x is.
+    The result is float32, float64 where x is. Half-precision latents are noised in float32: at high noise all that x
+    and x_src differ by is below the last digit of a half-precision x_t.
     A step with a(t) = 0 does not call the prior. Raises ConfigError where the rule lacks its source or gives no
     gradient, PriorError where the prior cannot serve the rule, NumericalError where g is not finite.
     """
     check_prior(rule, prior)
     a, b = rule.weights(timestep, prior.alphas_cumprod)
     _check_latents(rule, x, x_src, noise, b)
-    gradient = torch.zeros_like(x, dtype=torch.promote_types(x.dtype, torch.float32))
+    full = torch.promote_types(x.dtype, torch.float32)
+    x, noise, x_src = x.to(full), noise.to(full), None if x_src is None else x_src.to(full)
+    gradient = torch.zeros_like(x)
     if a != 0.0:
         abar = abar_at(prior.alphas_cumprod, timestep)
         scales = (guidance_scale, image_guidance_scale)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ..diffusion.closed_form import ClosedForm, noise_slope
-from ..diffusion.noise import abar_at
+from ..diffusion.noise import abar_at, signal_at
 from ..errors import ConfigError
 from .rules import EDIT_NULL, NOISE, Rule
 
@@ -60,7 +60,7 @@ def contraction(
 ) -> float:
     """The factor by which one step of replace.sample_rule multiplies the distance from the fixed point: it shrinks
     within -1..1 only."""
-    abar = abar_at(prior.alphas_cumprod, timestep)
+    abar = signal_at(prior.alphas_cumprod, timestep)
     a, _ = rule.weights(timestep, prior.alphas_cumprod)
     stiffness = mean_gradient(prior, rule, timestep, guidance_scale, image_guidance_scale).stiffness
     return 1.0 - ((1.0 - abar) / abar) ** 0.5 * stiffness / a
@@ -92,13 +92,18 @@ def balanced(
     rho = 1 is sum_t a sqrt(abar) n k_v = sum_t b with n = w_y - 1, for csd-like, whose branches share all but the
     instruction, n = w_y. The left side falls as the spread v grows. A rule without identity term (b = 0) comes to T(I)
     only as v grows without limit, and gets WIDE; so does one whose scale leaves nothing to balance (w_y <= 1).
-    Raises ConfigError where the identity term is too strong for any spread.
+    Raises ConfigError where the identity term is too strong for any spread, and at a timestep without noise.
     """
     if prior.config.s_image is not None or prior.config.s_null is not None:
         return prior
     surplus = guidance_scale if rule.reference == EDIT_NULL else guidance_scale - 1.0
     abars = [abar_at(prior.alphas_cumprod, t) for t in timesteps]
     weights = [rule.weights(t, prior.alphas_cumprod) for t in timesteps]
+    if max(abars) >= 1.0:
+        raise ConfigError(
+            f"system.guidance.prior.s_image: the run comes to rest at timestep {timesteps[abars.index(max(abars))]}, "
+            "which is noiseless (abar = 1), and nothing can be balanced there. Raise min_step_percent, or give s_image."
+        )
 
     def excess(spread: float) -> float:
         terms = zip(abars, weights, strict=True)

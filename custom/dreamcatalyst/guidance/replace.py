@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..diffusion.api import Prior
 from ..diffusion.combine import Branch, predict_difference
-from ..diffusion.noise import abar_at, add_noise
+from ..diffusion.noise import abar_at, add_noise, signal_at
 from ..errors import ConfigError
 from .distill import distillation_gradient
 from .rules import Rule
@@ -41,11 +41,11 @@ def denoise(
 ) -> Tensor:
     """Deterministic DDIM (Song et al. 2021, equation 12, eta = 0) along `timesteps` to clean latents, [B,C,h,w].
 
-    noisy [B,C,h,w]: latents at the noise level of timesteps[0].
+    noisy [B,C,h,w]: latents at the noise level of timesteps[0]. Raises PriorError at a level without signal.
     """
     x = noisy
     for i, t in enumerate(timesteps):
-        abar = abar_at(prior.alphas_cumprod, t)
+        abar = signal_at(prior.alphas_cumprod, t)
         after = abar_at(prior.alphas_cumprod, timesteps[i + 1]) if i + 1 < len(timesteps) else 1.0
         branch = Branch(x, text, image, guidance_scale, image_guidance_scale)
         eps = predict_difference(prior, branch, None, t).to(x.dtype)
@@ -106,7 +106,7 @@ def sample_rule(
     """
     x = x_src if start is None else start
     for i, t in enumerate(timesteps):
-        abar, (a, _) = abar_at(prior.alphas_cumprod, t), rule.weights(t, prior.alphas_cumprod)
+        abar, (a, _) = signal_at(prior.alphas_cumprod, t), rule.weights(t, prior.alphas_cumprod)
         if a == 0.0:
             raise ConfigError(f"rule '{rule.name}' has no weight on the edit at timestep {t}, so it cannot sample.")
         gradient = distillation_gradient(prior, rule, x, x_src, timestep=t, noise=noise(i), **conditions)

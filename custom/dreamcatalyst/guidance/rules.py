@@ -54,7 +54,8 @@ def pds_coefficients(alphas_cumprod: Tensor, timestep: int, gap: int = 2) -> tup
 
     z_t(x_tgt) - z_t(x_src) = Phi (x - x_src) + Psi (eps_edit - eps_ref), where alpha_t and beta_t are those of the
     single step t-1 -> t and the earlier step is p = t - gap. At gap 1 Phi is exactly zero: PDS has an identity term
-    only because its published code takes steps of two. Raises ConfigError where abar_p is 1 (sigma would be zero).
+    only because its published code takes steps of two. Raises ConfigError where abar_p is 1 (sigma would be zero), and
+    where abar_t is 0 (Psi would be infinite).
     """
     abar = torch.cat([torch.ones(1, dtype=torch.float64), alphas_cumprod.double()])
     phi, psi = pds_coefficients_from_betas(1.0 - abar[1:] / abar[:-1], timestep, gap)
@@ -82,6 +83,11 @@ def pds_coefficients_from_betas(betas: Tensor, timestep: int, gap: int = 2) -> t
         )
     log_q = log_alpha[earlier + 1 : timestep].sum()
     log_t = log_alpha[: timestep + 1].sum()
+    if torch.isneginf(log_t):
+        raise ConfigError(
+            f"system.guidance.timesteps: timestep {timestep} holds no signal (abar = 0: zero terminal SNR), and PDS "
+            "divides by it. Stay below it: lower max_step_percent."
+        )
     beta, abar_p, sqrt_q = betas[timestep], torch.exp(log_p), torch.exp(0.5 * log_q)
     one_minus_p, one_minus_t = -torch.expm1(log_p), -torch.expm1(log_t)
     sigma = torch.sqrt(beta * one_minus_p / one_minus_t)
