@@ -17,7 +17,7 @@ from .thresholds import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
 
 f32, i32 = np.float32, np.int32
 ALPHA_MIN, BLUR, MARGIN, NEAR = f32(ALPHA_MIN), f32(BLUR), f32(FRUSTUM_MARGIN), f32(NEAR)
-ZERO, HALF, ONE, TWO, TINY = f32(0), f32(0.5), f32(1), f32(2), f32(1e-12)
+ZERO, HALF, ONE, TWO, FOUR, TINY = f32(0), f32(0.5), f32(1), f32(2), f32(4), f32(1e-12)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -38,9 +38,12 @@ def _combine(a, x, b, y):
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _unit(quats, i):
+    """The unit quaternion and max(norm, 1e-12). The largest number is divided off first: squares would overflow."""
     w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
-    norm = max(math.sqrt(w * w + x * x + y * y + z * z), TINY)
-    return w / norm, x / norm, y / norm, z / norm, norm
+    largest = max(max(abs(w), abs(x)), max(abs(y), abs(z)), TINY)
+    w, x, y, z = w / largest, x / largest, y / largest, z / largest
+    norm = max(math.sqrt(w * w + x * x + y * y + z * z), TINY / largest)
+    return w / norm, x / norm, y / norm, z / norm, norm * largest
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -168,22 +171,31 @@ def _to_quaternion(g, q):
 @njit(error_model="numpy", fastmath={"contract"})
 def _covariance_gradient(ax, ay, conic, g, g_comp):
     """Derivatives in the two rows ax, ay from g = those in the conic (a, m, d), and from that in the compensation;
-    and the compensation, 1 where nothing depends on it."""
+    and the compensation, 1 where nothing depends on it.
+
+    With n = ax x ay and r = (ay x n + BLUR ax) / yy = ax - m ay:  1 / (2 a) = |r|^2 + BLUR (1 + m^2), and
+    da = -4 a^2 r (dax - m day),  dm = 2 d (ay dax + (r - m ay) day),  dd = -4 d^2 ay day.  By way of the covariance
+    (xx, xy, yy) these are differences of terms that grow with the square of a needle's length in pixels; r taken from
+    the cross product keeps its digits.
+    """
     a, m, d = conic
-    gxx = -TWO * a * a * g[0]
-    gxy = -TWO * m * gxx + TWO * d * g[1]
-    gyy = m * m * gxx - TWO * d * (m * g[1] + d * g[2])
-    if g_comp == ZERO:
-        return _combine(TWO * gxx, ax, gxy, ay), _combine(gxy, ax, TWO * gyy, ay), ONE
     n = _cross(ax, ay)
-    xx, xy, yy, area = _dot(ax, ax), _dot(ax, ay), _dot(ay, ay), math.sqrt(_dot(n, n))
-    det = area * area + BLUR * (xx + yy) + BLUR * BLUR
+    to_x = _cross(ay, n)
+    r = _combine(TWO * d, to_x, TWO * d * BLUR, ax)
+    ga, gm = -FOUR * a * a * g[0], TWO * d * g[1]
+    gax = _combine(ga, r, gm, ay)
+    gay = _combine(gm - m * ga, r, -m * gm - FOUR * d * d * g[2], ay)
+    if g_comp == ZERO:
+        return gax, gay, ONE
+    # compensation = |n| / sqrt(det), det = |n|^2 + rest
+    area = math.sqrt(_dot(n, n))
+    rest = BLUR * (_dot(ax, ax) + _dot(ay, ay)) + BLUR * BLUR
+    det = area * area + rest
     root = math.sqrt(det)
-    g_det = -HALF * g_comp * area / (root * det)
-    gxx, gxy, gyy = gxx + g_det * (yy + BLUR), gxy - TWO * g_det * xy, gyy + g_det * (xx + BLUR)
-    g_n = g_comp / (root * area) if area > ZERO else ZERO
-    to_x, to_y = _cross(ay, n), _cross(n, ax)
-    gax, gay = _combine(TWO * gxx, ax, gxy, ay), _combine(gxy, ax, TWO * gyy, ay)
+    g_n = g_comp / area * (rest / (root * det)) if area > ZERO else ZERO
+    g_rest = -g_comp * BLUR * area / (root * det)
+    to_y = _cross(n, ax)
+    gax, gay = _combine(ONE, gax, g_rest, ax), _combine(ONE, gay, g_rest, ay)
     return _combine(ONE, gax, g_n, to_x), _combine(ONE, gay, g_n, to_y), area / root
 
 
