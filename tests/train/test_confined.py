@@ -51,6 +51,27 @@ def test_every_attribute_moves_inside_of_the_mask(launch, statue):
         assert float(moved.float().mean()) > 0.4, name
 
 
+@pytest.mark.parametrize("condition", [[], ["system.mask.feather=0.1"]])
+def test_the_null_edit_in_a_mask_changes_no_bit(launch, condition):
+    options = ["system.guidance.guidance_scale=0", "system.guidance.noise=independent", MASK, *condition]
+    trial = launch("closed-form.yaml", "trainer.max_steps=4", *options)
+    source, last = (read_ply(trial / "save" / name) for name in ("source.ply", "last.ply"))
+    source = source[torch.argsort(inside(source).int(), stable=True)]  # what is frozen comes first
+    for name in PARAMETERS:
+        assert torch.equal(getattr(source, name), getattr(last, name)), name
+
+
+def test_what_shows_outside_is_taken_back(launch):
+    """Pixels beyond the mask ask for nothing, and splats of the mask that reach there are pulled back."""
+    kept, free = (
+        rows(
+            launch("closed-form.yaml", "trainer.max_steps=60", MASK, f"system.loss.lambda_outside={weight}", name=name)
+        )
+        for weight, name in ((1, "kept"), (0, "free"))
+    )
+    assert kept[-1]["psnr_source_outside"] > free[-1]["psnr_source_outside"] + 3
+
+
 def test_an_edit_inside_approaches_the_prior_s_and_leaves_the_rest(launch):
     trial = launch("closed-form.yaml", "trainer.max_steps=80", MASK, "system.report.every=0")
     curve = rows(trial)

@@ -139,6 +139,15 @@ class Guidance:
         image = source.permute(2, 0, 1)[None]
         return self._views.get(index, lambda: (self.prior.encode(image), self.prior.condition(image)))
 
+    def forget_views(self) -> None:
+        """Encode source views anew: the source is drawn otherwise from here on."""
+        self._views.clear()
+
+    def reduced(self, loss: Tensor) -> Tensor:
+        """Per-element terms [B,...] in the config's reduction, in balance with the rule's loss: their mean, or their
+        sum divided by the batch size."""
+        return loss.mean() if self.config.reduction == "mean" else loss.sum() / len(loss)
+
     def step(
         self,
         rgb: Tensor,

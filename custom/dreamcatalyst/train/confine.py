@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,27 @@ from ..segment.pictures import mask_panels
 
 if TYPE_CHECKING:
     from .edit import EditSystem
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a confined edit begins with. scene: N splats; editable: bool [N]; is_source: whether it is the source, too,
+    and not an edit of it."""
+
+    scene: Gaussians
+    editable: Tensor
+    is_source: bool
+
+    @cached_property
+    def edited(self) -> Gaussians:
+        """The editable splats as they were."""
+        return self.scene[self.editable]
+
+    @cached_property
+    def share(self) -> Tensor:
+        """[N,1]: 1 where a splat may change. Drawn as a feature, it says how much of a pixel may."""
+        return self.editable[:, None].to(self.scene.means)
+
 
 PICTURES = 4  # views that show the mask
 
@@ -66,14 +89,3 @@ def write_mask_pictures(system: EditSystem, found: Mask, request: MaskRequest) -
     shown = shown[:: max(1, len(shown) // PICTURES)][:PICTURES]
     rows = [picture_row(mask_panels(found, request, view)) for view in shown]
     return write_png(system.save_path("mask.png"), np.vstack(rows))
-
-
-@torch.no_grad()
-def seen_mask(system: EditSystem, index: int) -> Tensor:
-    """The splats that may change, as one view sees them among the splats of the moment, [H,W,1] in [0,1]: drawn in
-    the same pass as their colours."""
-    splats = system.splats
-    features = splats.frozen.means.new_zeros(splats.total, 1)
-    features[len(splats.frozen) :] = 1
-    drawn = system.draw(splats.edited, system.camera(index), frozen=system.frozen, features=features)
-    return drawn.features[0].clamp(0, 1)

@@ -25,7 +25,7 @@ from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
 from ..scene.ply import read_ply, write_ply
 from ..segment.api import MaskConfig
-from .confine import confine, seen_mask
+from .confine import Start, confine
 from .finite import require_finite
 from .plan import Draft, describe_edit
 from .preview import PreviewConfig, preview_sheet
@@ -52,11 +52,12 @@ class LossConfig:
     """What is minimised, as a sum of terms; the anchors' weights stand in `anchor`."""
 
     lambda_guidance: float = 1.0  # of the rule's loss (GaussianEditor's lambda_l1 = 10 for pictures)
+    lambda_outside: float = 1.0  # of L1 to the source where a mask lets nothing change: splats must not show up there
     lambda_perceptual: float = 0.0  # of LPIPS, for rules that deliver a picture (GaussianEditor's lambda_p = 10)
     perceptual_weights: str = ""  # a folder with VGG-16's and LPIPS's weight files (loss/perceptual.py)
 
     def __post_init__(self) -> None:
-        for name in ("lambda_guidance", "lambda_perceptual"):
+        for name in ("lambda_guidance", "lambda_outside", "lambda_perceptual"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected 0 or more.")
         if self.lambda_perceptual and not self.perceptual_weights:
@@ -111,7 +112,8 @@ class EditSystem(SplatSystem):
         self.truth: Truth | None = None
         self.perceptual: Lpips | None = None
         self.generations = self.part["anchor"].generations()
-        self._source_renders = ByteCache(self.cfg.source_cache_mib * 2**20)
+        self.start: Start | None = None
+        self._source_views = ByteCache(self.cfg.source_cache_mib * 2**20)
         self._references = ByteCache(self.cfg.source_cache_mib * 2**20)
         self._regions: dict[int, Tensor | None] = {}
 
@@ -155,6 +157,7 @@ class EditSystem(SplatSystem):
         state, editable = {}, None
         if self.part["mask"].kind != "none" and not self.resumed:  # a checkpoint knows what is editable
             scene, state, editable = confine(self, scene)
+            self.begin_at(scene, editable)
         splats = Splats(scene, state, editable)
         if self.generations is not None:
             self.generations.begin(splats)
@@ -163,11 +166,34 @@ class EditSystem(SplatSystem):
     def after_update(self) -> None:
         anchor_step(self.splats, self.generations, self.part["anchor"])
 
+    def begin_at(self, scene: Gaussians, editable: Tensor) -> None:
+        """Remember what a confined edit began with: bool [N], which splats of `scene` may change."""
+        self.start = Start(scene, editable, is_source=not self.cfg.original)
+        self._source_views.clear()  # drawn otherwise from here on
+        self.guidance.forget_views()
+
     @torch.no_grad()
+    def source_view(self, index: int) -> tuple[Tensor, Tensor | None]:
+        """The source at one view, [H,W,3], drawn once, and where it may change, [H,W,1] in [0,1] (None: everywhere).
+
+        As renders of the edit it is not clamped, and it is drawn in the same way: where nothing was edited, the two
+        must be equal to the bit.
+        """
+        return self._source_views.get(index, lambda: self._draw_source(self.camera(index)))
+
+    def _draw_source(self, camera: Cameras) -> tuple[Tensor, Tensor | None]:
+        if self.start is None:
+            return self.draw(self.source, camera).rgb[0], None
+        begun = self.draw(self.start.scene, camera, features=self.start.share)
+        if not self.start.is_source:
+            return self.draw(self.source, camera).rgb[0], begun.features[0]
+        if self.splats is None:
+            return begun.rgb[0], begun.features[0]
+        return self.draw(self.start.edited, camera, frozen=self.frozen).rgb[0], begun.features[0]
+
     def source_render(self, index: int) -> Tensor:
-        """The render of the source scene at one view, [H,W,3], drawn once. As renders of the edit it is not clamped:
-        where nothing was edited, the two must be equal to the bit."""
-        return self._source_renders.get(index, lambda: self.draw(self.source, self.camera(index)).rgb[0])
+        """The source at one view, [H,W,3], not clamped."""
+        return self.source_view(index)[0]
 
     def compare_with_photos(self) -> None:
         """Warn where renders of the source have nothing to do with the photographs of the same cameras; a made world's
@@ -193,11 +219,18 @@ class EditSystem(SplatSystem):
         index, losses = batch["index"], self.part["loss"]
         render = self.draw_now(self.camera(index))
         require_finite("render", colours=render.rgb)
-        sources = torch.stack([self.source_render(i) for i in index])
-        given = self.guidance.step(render.rgb, sources, index, step, self.max_steps, batch.get("visit"))
+        views = [self.source_view(i) for i in index]
+        sources, shown = torch.stack([source for source, _ in views]), render.rgb
+        if self.start is not None:  # elsewhere the prior sees the source, and asks for nothing
+            allowed = torch.stack([where for _, where in views])
+            shown = torch.lerp(sources, shown, allowed)
+        given = self.guidance.step(shown, sources, index, step, self.max_steps, batch.get("visit"))
         loss, numbers = losses.lambda_guidance * given.loss, {"t": given.timestep, "residual": given.gradient_rms}
+        if self.start is not None and losses.lambda_outside:
+            leak = self.guidance.reduced(((1 - allowed) * (render.rgb - sources)).abs())
+            loss, numbers["outside"] = loss + losses.lambda_outside * leak, float(leak.detach())
         if self.perceptual is not None:
-            distance = self.perceptual(render.rgb, given.target)
+            distance = self.perceptual(shown, given.target)
             loss, numbers["perceptual"] = loss + losses.lambda_perceptual * distance, float(distance.detach())
         if self.generations is not None:
             pull = anchor_loss(self.splats, self.generations, self.part["anchor"])
@@ -209,6 +242,8 @@ class EditSystem(SplatSystem):
         checkpoint["guidance"] = self.guidance.state_dict()
         if self.generations is not None:
             checkpoint["generations"] = self.generations.state_dict()
+        if self.start is not None:
+            checkpoint["editable"] = self.start.editable
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if "guidance" not in checkpoint:
@@ -220,6 +255,8 @@ class EditSystem(SplatSystem):
         self.guidance.load_state_dict(checkpoint["guidance"])
         if self.generations is not None:
             self.generations.load_state_dict(checkpoint.get("generations", {"weights": []}), self.splats)
+        if "editable" in checkpoint:
+            self.begin_at(self.first_scene().to(self.root_device), checkpoint["editable"].to(self.root_device))
 
     @property
     def title(self) -> str:
@@ -250,7 +287,7 @@ class EditSystem(SplatSystem):
             if index not in self._regions:
                 self._regions[index] = self.truth.region(self.draw, self.camera(index))
             return self._regions[index]
-        return None if self.splats.frozen is None else seen_mask(self, index).round()
+        return None if self.start is None else self.source_view(index)[1].round()
 
     def known_scenes(self) -> dict[str, Gaussians]:
         return {"source": self.source, **({} if self.truth is None else {"truth": self.truth.scene})}
