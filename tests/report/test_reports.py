@@ -7,7 +7,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
-from dreamcatalyst.report.curve import Curve
+from dreamcatalyst.report.curve import Curve, draw_curves
 from dreamcatalyst.report.metrics import METRICS, Metric
 from dreamcatalyst.report.pictures import picture_row, write_png, write_video
 
@@ -62,5 +62,5 @@ def test_curve(tmp_path):
     curve.add(step=1, seconds=1.0, psnr=3.0, t=7)
     curve.write_csv(tmp_path / "error.csv")
     assert (tmp_path / "error.csv").read_text().split() == ["step,seconds,psnr,t", "0,0.0,1.0,", "1,1.0,3.0,7"]
-    curve.plot(tmp_path / "error.png", {"PSNR": ["psnr"]}, {"level": 2.0})
+    draw_curves(tmp_path / "error.png", {"": curve}, {"PSNR": ["psnr"]}, {"level": 2.0})
     assert cv2.imread(str(tmp_path / "error.png")) is not None

@@ -36,7 +36,7 @@ def test_a_fit_approaches_its_photographs_and_leaves_everything(launch):
     for name in (
         "save/last.ply",
         "save/it60-comparison.png",
-        "report/error.png",
+        "report/error.svg",
         "ckpts/last.ckpt",
         "configs/parsed.yaml",
     ):

@@ -33,10 +33,6 @@ class Curve:
             writer.writeheader()
             writer.writerows(self.rows)
 
-    def plot(self, path: Path, groups: Mapping[str, Sequence[str]], lines: Mapping[str, float] | None = None) -> None:
-        """Draw columns against seconds. groups: axis label to its columns; lines: level marks on the first axis."""
-        draw_curves(path, {"": self}, groups, lines)
-
 
 def draw_curves(
     path: Path,

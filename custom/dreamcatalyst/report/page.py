@@ -12,32 +12,21 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from .chart import CHART_STYLE, COLOUR_STYLE
 from .pictures import to_uint8
 
 STYLE = """
-:root{--bg:#f6f5f2;--card:#fff;--ink:#1d1f23;--soft:#6b6f76;--line:#e3e1dc;--accent:#b4552d;
---c0:#b4552d;--c1:#2f6f9f;--c2:#4d8a4a;--c3:#8a5aa8;--c4:#b08a1e;--c5:#5b6470}
-@media(prefers-color-scheme:dark){:root{--bg:#16181c;--card:#1f2227;--ink:#e8e6e1;--soft:#9a9ea6;--line:#32363d;
---accent:#e08a5f;--c0:#e08a5f;--c1:#74b0dc;--c2:#86c282;--c3:#c49be0;--c4:#dcb95a;--c5:#a9b1bc}}
 *{box-sizing:border-box}
 body{margin:0;background:var(--bg);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
 main{max-width:1080px;margin:0 auto;padding:36px 20px 60px}
 h1{font-size:30px;line-height:1.2;margin:0 0 4px}h2{font-size:18px;margin:36px 0 12px}
 .sub{color:var(--soft);margin:0 0 22px}
 .tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(158px,1fr));gap:12px}
-.tile,.card,figure{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:12px 14px;margin:0}
+.tile,.card{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:12px 14px;margin:0}
 .tile b{display:block;font-size:24px;line-height:1.25;font-variant-numeric:tabular-nums}
 .tile span{color:var(--soft);font-size:13px}
 .charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(330px,1fr));gap:12px}
-figcaption{font-weight:600;font-size:14px;display:flex;justify-content:space-between;gap:10px;flex-wrap:wrap}
-figcaption span{font-weight:400;font-size:12px;margin-left:10px;color:var(--soft)}
-figcaption span::before{content:"";display:inline-block;width:10px;height:10px;border-radius:5px;margin-right:4px;
-background:var(--c)}
-svg{width:100%;height:auto;display:block}svg text{fill:var(--soft);font-size:11px}
-svg .grid{stroke:var(--line)}svg polyline{fill:none;stroke:var(--c);stroke-width:1.8;stroke-linejoin:round}
-svg circle{fill:var(--c)}
-.c0{--c:var(--c0)}.c1{--c:var(--c1)}.c2{--c:var(--c2)}.c3{--c:var(--c3)}.c4{--c:var(--c4)}.c5{--c:var(--c5)}
-.c6{--c:#9aa}.c7{--c:#ccb}
+svg{width:100%;height:auto;display:block}
 .slide{position:relative;overflow:hidden;border-radius:10px;max-width:640px;line-height:0;margin:0 auto}
 .slide img{width:100%;display:block}.slide .top{position:absolute;inset:0;clip-path:inset(0 50% 0 0)}
 .slide i{position:absolute;top:0;bottom:0;left:50%;width:2px;background:#fff;box-shadow:0 0 5px #0008}
@@ -76,7 +65,7 @@ class Table:
 @dataclass(frozen=True)
 class Page:
     """What stands on a page, from top to bottom. tiles: label to value. pictures: a row of labelled pictures [H,W,3] in
-    [0,1] for each view, of which the first two are before and after. charts: figures of `chart.line_chart`.
+    [0,1] for each view, of which the first two are before and after. charts: those of `chart.line_chart`.
     stages: seconds by stage. texts: headings to what stands below them, folded up."""
 
     title: str
@@ -93,7 +82,7 @@ class Page:
         body = [f"<h1>{escape(self.title)}</h1>", f'<p class="sub">{escape(self.subtitle)}</p>', _tiles(self.tiles)]
         shown = [[(label, data_uri(image)) for label, image in row] for row in self.pictures]
         body += [_slider(shown[0])] if shown and len(shown[0]) > 1 else []
-        if charts := [chart for chart in self.charts if chart]:
+        if charts := [f'<div class="card">{chart}</div>' for chart in self.charts if chart]:
             body.append(f'<h2>Against run time</h2><div class="charts">{"".join(charts)}</div>')
         body += [_stages(self.stages)] if sum(self.stages.values()) > 0 else []
         body += [_views(shown)] if shown else []
@@ -105,7 +94,7 @@ class Page:
         return (
             '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width,initial-scale=1">'
-            f"<title>{escape(self.title)}</title><style>{STYLE}</style></head>\n"
+            f"<title>{escape(self.title)}</title><style>{COLOUR_STYLE}{STYLE}{CHART_STYLE}</style></head>\n"
             f"<body><main>{''.join([*body, *folded])}</main><script>{SCRIPT}</script></body></html>\n"
         )
 

@@ -57,17 +57,19 @@ class Record:
             memory = peak_memory(system.root_device)
             row |= {} if memory is None else {"memory_mib": round(memory, 1)}
             row |= {"skipped": self.skipped} if self.skipped else {}
-            bound = self.config.overhead * clock.seconds
-            measured = step == 0 or step >= system.max_steps or clock.reporting + self._cost <= bound
+            spent = clock.reporting + 2 * self._cost  # with the last row, which is to come
+            measured = step in (0, system.max_steps) or spent <= self.config.overhead * clock.seconds
             self.curve.add(**row, **self.numbers, **(self._errors(system) if measured else {}))
             if measured:
                 self.curve.write_csv(system.report_dir / "error.csv")
 
     def _errors(self, system: SplatSystem) -> dict[str, float]:
         """Scores at the views of `views`, mean over them, and how fast the pictures change."""
+        for index in self.views(system):  # made once, and no part of what the next row will take
+            system.references(index)
         began = time.perf_counter()
         pictures = {index: system.picture(index) for index in self.views(system)}
-        errors = mean_scores([system.score(index, picture) for index, picture in pictures.items()])
+        errors = mean_scores([system.score(index, picture, brief=True) for index, picture in pictures.items()])
         if self._seen is not None and self.clock.seconds > self._seen[0]:
             then, before = self._seen
             moved = torch.stack([(pictures[index] - before[index]).abs().mean() for index in pictures]).mean()

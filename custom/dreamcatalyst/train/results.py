@@ -27,7 +27,7 @@ class ReportConfig:
 
     every: int = 50  # steps between two rows of report/error.csv; 0: first and last step only
     views: int = 4  # held-out views that each row is measured on
-    overhead: float = 0.02  # rows have their errors measured as long as rows take this share of the time at most
+    overhead: float = 0.025  # rows have their errors measured as long as rows take this share of the time at most
     synchronize: bool = False  # the clock waits for the device between stages: exact on a GPU, and a little slower
     pictures: int = 8  # comparisons written at the end
     video_frames: int = 72  # 0: no video
@@ -42,7 +42,7 @@ class ReportConfig:
             if getattr(self, name) < least:
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected {least} or more.")
         if not self.overhead >= 0:
-            raise ConfigError(f"overhead: got {self.overhead}, expected a share of the run's time, such as 0.02.")
+            raise ConfigError(f"overhead: got {self.overhead}, expected a share of the run's time, such as 0.025.")
         for name in ("clip_source", "clip_target", "aesthetic"):
             if getattr(self, name) and not self.clip:
                 raise ConfigError(f"{name}: is for a CLIP, and none is given. Name one: report.clip=<folder or id>.")

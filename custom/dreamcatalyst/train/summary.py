@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import OmegaConf
 
-from ..report.chart import line_chart
+from ..report.chart import line_chart, picture_file
 from ..report.curve import Curve
 from ..report.machine import machine, versions
 from ..report.page import Page, Table
@@ -54,7 +54,7 @@ def plain(values: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]]) -> list[Path]:
-    """Write error.csv and error.png (where there was training), index.html and summary.json; return their folder.
+    """Write error.csv and error.svg (where there was training), index.html and summary.json; return their folder.
 
     The summary's "overhead" says what reports took: rows, this function, and the share of both in the whole.
     """
@@ -63,7 +63,8 @@ def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]])
     mean, seconds = mean_scores(list(scores.values())), record.clock.seconds
     if record.curve.rows:
         record.curve.write_csv(folder / "error.csv")
-        plot(record.curve, folder / "error.png")
+        plots = [chart for start, chart in charts(record.curve).items() if start in ("psnr_", "ssim_", "l1_")]
+        (folder / "error.svg").write_text(picture_file(plots), encoding="utf-8")
     summary = {
         "step": system.true_global_step,
         "seconds": round(seconds, 2),
@@ -83,24 +84,19 @@ def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]])
     return [folder]
 
 
-def plot(curve: Curve, path: Path) -> None:
-    """The errors against seconds, as a picture."""
-    groups = {}
-    for metric, unit in (("psnr", "PSNR, dB"), ("ssim", "SSIM")):
-        columns = [c for c in curve.columns if c.startswith(f"{metric}_")]
-        groups |= {f"{unit}, held-out views": columns} if columns else {}
-    if groups:
-        curve.plot(path, groups)
-
-
-def charts(curve: Curve) -> Iterable[str]:
-    """Everything that the rows tell, against seconds, as figures of a page."""
+def charts(curve: Curve) -> dict[str, str]:
+    """What the rows tell against seconds, by how the columns begin. Of an edit that is confined, errors where it is and
+    where it is not."""
+    confined, drawn = any(c.endswith("_inside") for c in curve.columns), {}
     for title, start, log in CHARTS:
         columns = [c for c in curve.columns if c.startswith(start) and (start.endswith("_") or c == start)]
-        series = {c.removeprefix(start) or c: [(r["seconds"], r[c]) for r in curve.rows if c in r] for c in columns}
-        if start == "splats" and len({row[start] for row in curve.rows}) == 1:
+        if confined and start in ("psnr_", "ssim_", "l1_"):
+            columns = [c for c in columns if c.endswith(("_inside", "_outside"))]
+        if columns == ["splats"] and len({row["splats"] for row in curve.rows}) == 1:
             continue
-        yield line_chart(title, series, log=log)
+        series = {c.removeprefix(start) or c: [(r["seconds"], r[c]) for r in curve.rows if c in r] for c in columns}
+        drawn[start] = line_chart(title, series, log=log)
+    return drawn
 
 
 def score_rows(names: Sequence[str], scores: Sequence[Mapping[str, float]]) -> Table:
@@ -114,7 +110,12 @@ def score_rows(names: Sequence[str], scores: Sequence[Mapping[str, float]]) -> T
 def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mapping[str, float]]) -> Page:
     """The page of a run."""
     mean, views, folder = mean_scores(list(scores.values())), system.capture.views, system.report_dir.parent
-    tiles = {LABELS[name]: f"{mean[name]:.4g}" for name in LABELS if name in mean}
+    best = next((name for name in LABELS if name in mean), None)  # the first of several is the one that counts
+    tiles = {
+        label: f"{mean[name]:.4g}"
+        for name, label in LABELS.items()
+        if name in mean and (name == best or name[:5] != "psnr_")
+    }
     tiles |= {"steps": f"{summary['step']:,}", "seconds in training": f"{summary['seconds']:,.1f}"}
     tiles |= {"splats": f"{summary['splats']:,}"} | (
         {"steps left out": f"{system.record.skipped}"} if system.record.skipped else {}
@@ -130,7 +131,7 @@ def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mappin
         subtitle=f"{folder.parent.name}/{folder.name} · {system.capture.source} · {summary['machine']['processor']}",
         tiles=tiles,
         pictures=[system.panels(index) for index in shown],
-        charts=list(charts(system.record.curve)),
+        charts=list(charts(system.record.curve).values()),
         stages=summary["stages"],
         tables={"Scores": score_rows([views[i].name for i in scores], list(scores.values()))} if scores else {},
         texts={**texts, "Config": config_text(system), "Machine": given["machine"], "Versions": given["versions"]},

@@ -285,11 +285,11 @@ class SplatSystem(plugin.BaseSystem):
 
     # --- measuring
 
-    def score(self, index: int, image: Tensor | None = None) -> dict[str, float]:
-        """Every metric of one view against each of its references (`report.metrics.compare`). image: the picture of
-        the view, where it is there already."""
+    def score(self, index: int, image: Tensor | None = None, brief: bool = False) -> dict[str, float]:
+        """Metrics of one view against each of its references (`report.metrics.compare`). image: the picture of the
+        view, where it is there already."""
         image = self.picture(index) if image is None else image
-        return compare(image, self.references(index), self.region(index))
+        return compare(image, self.references(index), self.region(index), brief)
 
     def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
         for index in batch["index"]:
