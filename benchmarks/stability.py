@@ -18,10 +18,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "custom"), str(ROOT)]
 
-from benchmarks.stiff import noise, splats  # noqa: E402
+from benchmarks.stiff import anchors, noise, splats, training  # noqa: E402
 from benchmarks.stiff.cases import Case, Check  # noqa: E402
 
-CASES: list[Case] = [*noise.CASES, *splats.CASES]
+CASES: list[Case] = [*noise.CASES, *splats.CASES, *anchors.CASES, *training.CASES]
 
 
 def line(case: Case, check: Check) -> str:
@@ -34,10 +34,10 @@ def line(case: Case, check: Check) -> str:
     )
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("words", nargs="*", help="only cases whose group and name hold all of these words")
-    words = parser.parse_args().words
+    words = parser.parse_args(argv).words
     chosen = [case for case in CASES if all(word in f"{case.group} {case.name}" for word in words)]
     print("| group | case | quantity | finite | error | tolerance | verdict |\n|---|---|---|---|---:|---:|---|")
     started, failed, lines = time.perf_counter(), [], 0

@@ -231,7 +231,7 @@ CASES = [
         "quaternions of 1e30 to 1e-10": drawn(times("quats", [1e30, 1e-10, 1.0])),
         "30 coincident splats": drawn(put(means=[0.1, -0.05, DEPTH])),
         "3000 coincident splats": drawn(put(means=[0.1, -0.05, DEPTH]), n=3000, camera=pinhole(9, 7)),
-        "a million on one ray, opaque": drawn(on_a_ray, n=10**6, degree=0, camera=pinhole(1, 1), margin=1e-4),
+        "100,000 on one ray, opaque": drawn(on_a_ray, n=10**5, degree=0, camera=pinhole(1, 1), margin=1e-4),
         "a million on one ray, faint": drawn(
             both(on_a_ray, put(logit_opacities=-5.4)), n=10**6, degree=0, camera=pinhole(1, 1), margin=1e-4
         ),
