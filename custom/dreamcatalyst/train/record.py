@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 class Record:
     """The rows of `curve`. Each holds what costs nothing: step, seconds in all (without reports) and by stage, both
     since the start; splats, memory, and the numbers of the step. Errors at held-out views are measured in the first
-    row, in the last, and in those between as long as reports stay within `report.overhead` of the run's time."""
+    row, in the last, and in as many between as keep rows within `report.overhead` of the run's time."""
 
     def __init__(self, config: ReportConfig):
         self.config, self.clock, self.curve = config, Clock(), Curve()
         self.numbers: dict[str, float] = {}  # of the latest step
         self.skipped = 0  # steps that were left out because something in them was not finite
-        self._cost = 0.0  # seconds of the latest measurement
+        self._cost, self._measured = 0.0, 0  # seconds and step of the latest measurement
         self._seen: tuple[float, dict[int, Tensor]] | None = None  # the seconds and the pictures of it
 
     def begin(self, system: SplatSystem) -> None:
@@ -57,11 +57,20 @@ class Record:
             memory = peak_memory(system.root_device)
             row |= {} if memory is None else {"memory_mib": round(memory, 1)}
             row |= {"skipped": self.skipped} if self.skipped else {}
-            spent = clock.reporting + 2 * self._cost  # with the last row, which is to come
-            measured = step in (0, system.max_steps) or spent <= self.config.overhead * clock.seconds
+            measured = self._due(step, system.max_steps)
             self.curve.add(**row, **self.numbers, **(self._errors(system) if measured else {}))
             if measured:
+                self._measured = step
                 self.curve.write_csv(system.report_dir / "error.csv")
+
+    def _due(self, step: int, last: int) -> bool:
+        """Whether the errors of this row are measured: so that the rows that can still be paid for, if the run goes on
+        as fast as so far, are spread evenly over the steps that are left."""
+        if step == 0 or step >= last:
+            return True
+        budget = self.config.overhead * self.clock.seconds * last / step
+        rows = (budget - self.clock.reporting) / max(self._cost, 1e-6) - 1  # the last one is put by
+        return rows >= 1 and (step - self._measured) * rows >= last - step
 
     def _errors(self, system: SplatSystem) -> dict[str, float]:
         """Scores at the views of `views`, mean over them, and how fast the pictures change."""
