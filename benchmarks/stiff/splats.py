@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import tempfile
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from dreamcatalyst.data.camera import Cameras
+from dreamcatalyst.data.views import open_capture
 from dreamcatalyst.render.api import rasterize
 from dreamcatalyst.render.projection import project
 from dreamcatalyst.render.thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
+from dreamcatalyst.scene.ply import read_ply, write_ply
+from dreamcatalyst.scene.plyfile import read_vertices
 from torch import Tensor
 
 from .cases import Case, Check, compare, worst
@@ -104,21 +112,57 @@ def drawn(
         half_seen = half_seen.to(dtype=torch.float64)
         if crop is not None:
             seen, half_seen = seen.cropped(*crop), half_seen.cropped(*crop)
-        open_ = decided(scene, seen, options.get("antialiased", False), margin)
-        size = seen.height, seen.width, 4
-        cotangents = torch.randn(size, generator=torch.Generator().manual_seed(7)).double() * open_[..., None]
-        truth, slopes = outcome(scene, seen, "reference", cotangents, **options)
-        rounded, moved = outcome(half.to(dtype=torch.float64), half_seen, "reference", cotangents, **options)
-        got, grads = outcome(half, cameras, "cpu", cotangents, crop and crop[:2], **options)
-        image = compare("image", got * open_[..., None], truth * open_[..., None], rounded * open_[..., None])
-        each = {name: compare(name, grads[name], slopes[name], moved[name]) for name in PARAMETERS}
-        finite = image.finite and bool(got.isfinite().all())
-        share = float(open_.double().mean())
-        if share < LEAST:
-            raise ValueError(f"only {share:.0%} of the pixels are decided, so that little would be shown")
-        return [Check("image", finite, image.error, image.tolerance), worst("gradient", each)]
+        rounded = half.to(dtype=torch.float64), half_seen
+        return judged((scene, seen), rounded, (half, cameras), crop and crop[:2], margin, **options)
 
     return run
+
+
+def judged(
+    true: tuple[Gaussians, Cameras],
+    rounded: tuple[Gaussians, Cameras],
+    given: tuple[Gaussians, Cameras],
+    window: tuple[int, int] | None = None,
+    margin: float = MARGIN,
+    **options: Any,
+) -> list[Check]:
+    """Image and derivatives of the compiled renderer for `given` against the reference's for `true` and `rounded`."""
+    settled = decided(*true, options.get("antialiased", False), margin)
+    share = float(settled.double().mean())
+    if share < LEAST:
+        raise ValueError(f"only {share:.0%} of the pixels are decided, so that little would be shown")
+    where = settled[..., None]
+    cotangents = torch.randn(*settled.shape, 4, generator=torch.Generator().manual_seed(7)).double() * where
+    truth, slopes = outcome(*true, "reference", cotangents, **options)
+    nearby, moved_slopes = outcome(*rounded, "reference", cotangents, **options)
+    got, grads = outcome(*given, "cpu", cotangents, window, **options)
+    image = compare("image", got * where, truth * where, nearby * where)
+    each = {name: compare(name, grads[name], slopes[name], moved_slopes[name]) for name in PARAMETERS}
+    finite = image.finite and bool(got.isfinite().all())
+    return [Check("image", finite, image.error, image.tolerance), worst("gradient", each)]
+
+
+def recentred() -> list[Check]:
+    """Splats (a PLY of doubles) and cameras (INRIA's cameras.json) of a world around 1e6, as they are loaded, and what
+    is written again."""
+    scene, cameras, far = cloud(), pinhole(20, 16), np.array(FAR_AWAY)
+    K = cameras.Ks.clone()
+    K[:, :2, 2] = torch.tensor([10.0, 8.0])  # this format's principal point is the middle
+    cameras = replace(cameras, Ks=K)
+    with tempfile.TemporaryDirectory() as folder:
+        ply = write_ply(Path(folder) / "far.ply", scene, origin=FAR_AWAY)
+        axes, focal, size = np.eye(3).tolist(), float(K[0, 0, 0]), {"width": 20, "height": 16}
+        places = [(far + [x, 0, 0]).tolist() for x in (0.0, -2.0, 2.0)]
+        entries = [{"position": place, "rotation": axes, "fx": focal, "fy": focal, **size} for place in places]
+        (Path(folder) / "cameras.json").write_text(json.dumps(entries))
+        capture = open_capture(Path(folder))
+        loaded = read_ply(ply, origin=capture.origin)
+        written = read_vertices(write_ply(Path(folder) / "again.ply", loaded, origin=capture.origin))
+        back = torch.from_numpy(np.stack([written.columns[name] for name in "xyz"], axis=1) - far)
+    rounded = scene.to(dtype=torch.float32).to(dtype=torch.float64), cameras.to(dtype=torch.float32)
+    rounded = rounded[0], rounded[1].to(dtype=torch.float64)
+    checks = judged((scene, cameras), rounded, (loaded, capture.views[0].camera))
+    return [*checks, compare("positions written", back, scene.means, rounded[0].means)]
 
 
 # --- the changes
@@ -206,6 +250,7 @@ def at_depths(*depths: float) -> Callable[[Gaussians], None]:
     return change
 
 
+FAR_AWAY = (1e6, -1e6, 1e6)
 NEAR_SIDES = (0.01 * (1 - 1e-3), 0.01 * (1 + 1e-3), 0.02)
 CASES = [
     Case("splats", name, run)
@@ -242,7 +287,8 @@ CASES = [
         "far away, 1e4": drawn(camera=pinhole(focal=1.4e4 / DEPTH, eye=(0, 0, -1e4))),
         "far away, 1e6, in layers": drawn(in_layers, camera=pinhole(focal=1.4e6 / DEPTH, eye=(0, 0, -1e6))),
         "far away, 1e6, all on one pixel": drawn(in_layers, camera=pinhole(eye=(0, 0, -1e6))),
-        "a world around 1e6, as it stands": drawn(moved(1e6, -1e6, 1e6), camera=pinhole(eye=(1e6, -1e6, 1e6))),
+        "a world around 1e6, as it is loaded": recentred,
+        "a world around 1e6, left where it is": drawn(moved(*FAR_AWAY), camera=pinhole(eye=FAR_AWAY)),
         "a world of 1e-4": drawn(both(times("means", 1e-1), times("log_scales", 2.0)), camera=pinhole()),
         "colour coefficients of 1e3": drawn(both(times("sh0", 1e3), times("shN", 1e3)), degree=3),
         "colour coefficients of -1e3": drawn(put(sh0=-1e3)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import torch
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.errors import SceneError
@@ -20,6 +22,7 @@ from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 from dreamcatalyst.scene.mask import threshold
 from dreamcatalyst.scene.ply import read_ply, write_ply
+from dreamcatalyst.scene.plyfile import read_vertices
 from dreamcatalyst.train.densify import DensifyConfig, densify, observe, screen_statistics
 from dreamcatalyst.train.fit import FitSystem
 from dreamcatalyst.train.optim import LearningRates
@@ -27,7 +30,7 @@ from torch import Tensor
 
 from .anchors import ADAM
 from .cases import Case, Check, bound, compare, refused, same
-from .splats import cloud, pinhole
+from .splats import FAR_AWAY, cloud, pinhole
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = 5
@@ -213,6 +216,36 @@ def resumed() -> list[Check]:
         return checks
 
 
+def far_away() -> list[Check]:
+    """A world around 1e6, splats and cameras beside them: it is edited, and written where it was."""
+    far, scene, folder_name = np.array(FAR_AWAY), make_world("statue").scene, "far"
+    with runs() as launch:
+        folder = launch.folder / folder_name
+        given = write_ply(folder / "far.ply", scene, origin=FAR_AWAY)
+        angles = np.arange(5) * 0.4
+        entries = []
+        for angle in angles:  # from all around, along x and y, with the third axis up
+            forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+            rotation = np.stack([np.array([-forward[1], forward[0], 0]) * -1, np.array([0, 0, -1.0]), forward], axis=1)
+            place = far - 3 * forward + [0, 0, 0.6]
+            lens = {"width": 24, "height": 24, "fx": 30.0, "fy": 30.0}
+            entries.append({"position": place.tolist(), "rotation": rotation.tolist(), **lens})
+        (folder / "cameras.json").write_text(json.dumps(entries))
+        trial, status, said = launch(
+            "closed-form.yaml", "trainer.max_steps=2", f"system.gs_source={given}", "data.source="
+        )
+        source, last_ = (read_vertices(trial / "save" / name).columns for name in ("source.ply", "last.ply"))
+        truth = scene.means.double()
+        back, moved = (torch.from_numpy(np.stack([c[name] for name in "xyz"], axis=1) - far) for c in (source, last_))
+    rate = 2 * 1.6e-4 * 10  # of the means, in an extent of less than 10
+    return [
+        ended(status, 0, said),
+        compare("positions of source.ply", back, truth, truth),
+        bound("moved at most", float((moved - truth).abs().max()), rate),
+        bound("colours that did not move", float((source["f_dc_0"] == last_["f_dc_0"]).mean()), 0.9),
+    ]
+
+
 @contextmanager
 def poisoned(at: int, factor: float) -> Iterator[None]:
     """Fits whose loss has at step `at` a derivative times `factor`."""
@@ -282,5 +315,6 @@ CASES = [
         "a run with an infinite derivative, left out": infinite_view("skip"),
         "a run of one step": one_step,
         "a run taken up at any step": resumed,
+        "a run in a world around 1e6": far_away,
     }.items()
 ]

@@ -63,7 +63,7 @@ def read(source: Path, options: CaptureOptions) -> Scan:
     if not points:
         return Scan(shots, None, [*notices, f"{folder}: has no points to begin with"])
     xyz, rgb = np.array([p.xyz for p in points]), np.array([p.color for p in points]) / 255
-    return Scan(shots, Points(torch.from_numpy(xyz).float(), torch.from_numpy(rgb).float()), notices)
+    return Scan(shots, Points(torch.from_numpy(xyz).double(), torch.from_numpy(rgb).float()), notices)
 
 
 def lens(camera: pycolmap.Camera, where: object = "camera") -> Lens:

@@ -150,7 +150,7 @@ def _points(path: Path, meta: dict) -> Points | None:
         raise DataError(f"{path}: its ply_file_path {cloud_path} is missing; remove the key to do without points")
     try:
         cloud = trimesh.load(cloud_path)
-        xyz = np.array(cloud.vertices, np.float32)
+        xyz = np.array(cloud.vertices, np.float64)
     except Exception as error:  # each of trimesh's readers raises its own kinds
         raise DataError(f"{cloud_path}: cannot be read as a point cloud ({type(error).__name__}: {error})") from error
     colors = np.asarray(getattr(cloud, "colors", None))

@@ -19,6 +19,7 @@ from ..registry import Registry
 from .camera import Cameras
 from .images import ImageCache, Photo, image_size
 from .lens import Lens
+from .origin import ZERO, Origin, far_origin
 
 FORMATS = Registry("dataset format", __package__)
 FORMATS.add("colmap", ".colmap:FORMAT")
@@ -61,7 +62,8 @@ class CaptureOptions:
 
 
 class Points(NamedTuple):
-    """Points of a reconstruction. xyz [P,3] world units, rgb [P,3] in [0,1]."""
+    """Points of a reconstruction. xyz [P,3] world units (float64 as a format reads them, float32 in a capture), rgb
+    [P,3] in [0,1]."""
 
     xyz: Tensor
     rgb: Tensor
@@ -110,7 +112,8 @@ class View:
 class Capture:
     """Views sorted by name; train and test are indices into them. source: the folder or file that was read.
 
-    points: those of the reconstruction, if any. notices: sentences for the user about what was left aside.
+    points: those of the reconstruction, if any. notices: sentences for the user about what was left aside. origin: the
+    point of the files' world that is (0,0,0) here (data/origin.py).
     """
 
     source: Path
@@ -120,6 +123,7 @@ class Capture:
     points: Points | None = None
     notices: tuple[str, ...] = ()
     options: CaptureOptions = CaptureOptions()
+    origin: Origin = ZERO
 
     def __len__(self) -> int:
         return len(self.views)
@@ -177,7 +181,7 @@ class Capture:
         if points is not None:
             xyz = points.xyz.double() @ similarity[:3, :3].T + similarity[:3, 3]
             points = Points(xyz.to(points.xyz.dtype), points.rgb)
-        return replace(self, views=views, points=points)
+        return replace(self, views=views, points=points, origin=ZERO)
 
     @cached_property
     def _cache(self) -> ImageCache:
@@ -215,14 +219,17 @@ def open_capture(source: str | Path, options: CaptureOptions = CaptureOptions())
         raise DataError(f"{found}: is an empty reconstruction: no photograph has a camera. Reconstruct it again")
     shots = sorted(scan.shots, key=lambda shot: shot.name)
     _check(found, shots)
+    shots, points, origin = _recentred(shots, scan.points)
     views = [_view(shot, options) for shot in shots]
     train, test = split(len(views), options, found)
-    capture = Capture(found, views, train, test, scan.points, tuple(scan.notices), options)
+    capture = Capture(found, views, train, test, points, tuple(scan.notices), options, origin)
     if not options.dataparser:
         return capture
     from .transforms import splats_from_capture
 
-    return capture.transformed(splats_from_capture(options.dataparser, found))
+    back = torch.eye(4, dtype=torch.float64)
+    back[:3, 3] = torch.tensor(origin, dtype=torch.float64)
+    return capture.transformed(splats_from_capture(options.dataparser, found).double() @ back)
 
 
 def split(n: int, options: CaptureOptions, where: object = "capture") -> tuple[list[int], list[int]]:
@@ -269,6 +276,22 @@ def _check(source: Path, shots: list[Shot]) -> None:
         rotation = shot.viewmat[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2) or not np.linalg.det(rotation) > 0:
             raise DataError(f"{source}: the pose of '{shot.name}' is not a rotation and a translation")
+
+
+def _recentred(shots: list[Shot], points: Points | None) -> tuple[list[Shot], Points | None, Origin]:
+    """Cameras and points (float32) of a world that is far away moved to its middle, and where that is."""
+    origin = far_origin(np.stack([-shot.viewmat[:3, :3].T @ shot.viewmat[:3, 3] for shot in shots]))
+    if points is not None:
+        xyz = points.xyz.double() - torch.tensor(origin, dtype=torch.float64)
+        points = Points(xyz.float(), points.rgb)
+    if origin == ZERO:
+        return shots, points, origin
+    moved = []
+    for shot in shots:
+        viewmat = shot.viewmat.copy()
+        viewmat[:3, 3] += viewmat[:3, :3] @ np.array(origin)
+        moved.append(replace(shot, viewmat=viewmat))
+    return moved, points, origin
 
 
 def _view(shot: Shot, options: CaptureOptions) -> View:

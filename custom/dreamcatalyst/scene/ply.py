@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data.origin import ZERO, Origin, far_origin
 from ..errors import SceneError
 from .gaussians import SH_C0, Gaussians
 from .plyfile import PlyTable, read_vertices, write_vertices
@@ -22,13 +23,14 @@ MEANS, NORMALS, DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "
 SCALES, QUATS, RGB = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)], ["red", "green", "blue"]
 
 
-def read_ply(path: str | Path, *, drop_nonfinite: bool = False) -> Gaussians:
+def read_ply(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin = ZERO) -> Gaussians:
     """Read splats; parameters become float32 whatever the file's number type.
 
     The SH degree is the file's. Without f_dc_*, colours come from red, green, blue (0..255), as nerfstudio may export.
     Properties that 3DGS does not know go to `extra` under their own name, in their own number type (ushort and uint
     as int32 and int64, which torch computes with); nx, ny, nz too, unless all are zero.
     drop_nonfinite: leave out splats with a NaN or infinite parameter and print how many, instead of raising.
+    origin: the point of the file's world that becomes (0,0,0); taken off before positions become float32.
     Raises SceneError: no such file, not a PLY, truncated, no splats in it (a mesh, a point cloud, compressed
     splats), a missing property, no rows, rows that are not finite.
     """
@@ -49,7 +51,7 @@ def read_ply(path: str | Path, *, drop_nonfinite: bool = False) -> Gaussians:
     if all(not extra[name].any() for name in NORMALS if name in extra):
         extra = {name: value for name, value in extra.items() if name not in NORMALS}
     scene = Gaussians(
-        means=torch.from_numpy(table.matrix(MEANS)),
+        means=torch.from_numpy(table.matrix(MEANS) if origin == ZERO else _positions(table, origin)),
         quats=torch.from_numpy(table.matrix(QUATS)),
         log_scales=torch.from_numpy(table.matrix(SCALES)),
         logit_opacities=torch.from_numpy(table.matrix(["opacity"]))[:, 0],
@@ -60,11 +62,12 @@ def read_ply(path: str | Path, *, drop_nonfinite: bool = False) -> Gaussians:
     return _finite(path, scene, drop_nonfinite)
 
 
-def write_ply(path: str | Path, scene: Gaussians) -> Path:
+def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO) -> Path:
     """Write splats as float32 in INRIA's order, extras after them; returns the path. Folders are made as needed.
 
     Extras keep their number type (bool as uchar; int64 as uint or int where it fits; half types as float); an extra
     [N,k] becomes the k properties name_0 .. name_{k-1}. Normals are zero unless `extra` has nx, ny, nz.
+    origin: as in `read_ply`; it is added to x, y, z, which are then written as doubles.
     The file appears under its name only when it is complete. Raises SceneError where an extra cannot be written.
     """
     path = Path(path)
@@ -88,14 +91,35 @@ def write_ply(path: str | Path, scene: Gaussians) -> Path:
     clash = sorted(set(names) & set(extra))
     if clash:
         raise SceneError(f"{path}: extra '{clash[0]}' has the name of a splat property; rename it")
+    before = {}
+    if origin != ZERO:
+        before = dict(zip(MEANS, (scene.means.double().numpy() + origin).T, strict=True))
+        names, core = names[len(MEANS) :], core[:, len(MEANS) :]
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        write_vertices(part, names, core, extra)
+        write_vertices(part, names, core, extra, before)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
     return path
+
+
+def ply_origin(path: str | Path) -> Origin:
+    """Where the splats (or points) of a file lie, for `read_ply`, by up to ten thousand of them; zero unless they are
+    far away. Raises SceneError as `read_ply` does where there is no such file."""
+    table = read_vertices(Path(path))
+    every = max(1, table.count // 10_000)
+    if not set(MEANS) <= set(table.columns):
+        return ZERO
+    some = np.stack([table.columns[name][::every] for name in MEANS], axis=1).astype(np.float64)
+    return far_origin(some[np.isfinite(some).all(axis=1)])
+
+
+def _positions(table: PlyTable, origin: Origin) -> np.ndarray:
+    """Positions [N,3] float32 from `origin`, the difference taken in float64."""
+    whole = np.stack([table.columns[name] for name in MEANS], axis=1).astype(np.float64)
+    return (whole - origin).astype(np.float32)
 
 
 def _rest_names(path: Path, table: PlyTable) -> list[str]:

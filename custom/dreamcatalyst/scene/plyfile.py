@@ -81,17 +81,28 @@ def read_vertices(path: Path) -> PlyTable:
     return PlyTable(columns, vertex.count, {e.name: e.count for e in elements})
 
 
-def write_vertices(path: Path, names: list[str], core: np.ndarray, extra: dict[str, np.ndarray]) -> None:
-    """Write one `vertex` element, binary little endian: `core` [N, len(names)] as float, then the columns `extra`."""
-    rows = len(core)
-    kinds = [("float", name) for name in names] + [(NAMES[c.dtype.str[1:]], name) for name, c in extra.items()]
+def write_vertices(
+    path: Path,
+    names: list[str],
+    core: np.ndarray,
+    extra: dict[str, np.ndarray],
+    before: dict[str, np.ndarray] | None = None,
+) -> None:
+    """Write one `vertex` element, binary little endian: the columns `before`, `core` [N, len(names)] as float, and the
+    columns `extra`."""
+    rows, before = len(core), before or {}
+
+    def kinds_of(columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:
+        return [(NAMES[column.dtype.str[1:]], name) for name, column in columns.items()]
+
+    kinds = [*kinds_of(before), *(("float", name) for name in names), *kinds_of(extra)]
     header = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n{}end_header\n".format(
         rows, "".join(f"property {kind} {name}\n" for kind, name in kinds)
     )
-    layout = [(" core", "<f4", (len(names),))] + [(name, "<" + c.dtype.str[1:]) for name, c in extra.items()]
-    table = np.empty(rows, layout)
+    first, last = ([(name, "<" + c.dtype.str[1:]) for name, c in columns.items()] for columns in (before, extra))
+    table = np.empty(rows, [*first, (" core", "<f4", (len(names),)), *last])
     table[" core"] = core
-    for name, column in extra.items():
+    for name, column in {**before, **extra}.items():
         table[name] = column
     with path.open("wb") as file:
         file.write(header.encode())

@@ -69,7 +69,7 @@ class MaskRequest:
     scene: N splats. cameras: one batch of one per view of the capture, names: theirs; views: numbers of the views that
     may be looked at (those of training). extent: of the scene, world units, as `Capture.extent`. render: number of a
     view to its source render [H,W,3]. guidance: for kinds that ask the prior. prompt: the instruction.
-    backend, antialiased, background: how `render` draws.
+    backend, antialiased, background: how `render` draws. origin: the point of the user's world that is (0,0,0) here.
     """
 
     scene: Gaussians
@@ -83,6 +83,7 @@ class MaskRequest:
     backend: str = "auto"
     antialiased: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def spread(self, count: int | None) -> list[int]:
         """`count` of `views` spread evenly over them, all where there are no more or count is None."""

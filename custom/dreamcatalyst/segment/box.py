@@ -46,11 +46,14 @@ class Box(Segmenter):
 
     def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor] | Tensor:
         means = request.scene.means.detach()
+
+        def here(point: tuple[float, float, float]) -> Tensor:
+            return means.new_tensor([a - b for a, b in zip(point, request.origin, strict=True)])
+
         if self.low:
-            inside = (means >= means.new_tensor(self.low)) & (means <= means.new_tensor(self.high))
-            return inside.all(dim=1).to(means)
+            return ((means >= here(self.low)) & (means <= here(self.high))).all(dim=1).to(means)
         if self.center:
-            return ((means - means.new_tensor(self.center)).norm(dim=1) <= self.radius).to(means)
+            return ((means - here(self.center)).norm(dim=1) <= self.radius).to(means)
         number = self.number(request)
         return {number: self.rectangle(request.cameras[number].width, request.cameras[number].height)}
 

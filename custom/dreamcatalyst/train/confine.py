@@ -80,6 +80,7 @@ def mask_request(system: EditSystem, scene: Gaussians) -> MaskRequest:
         backend=renderer.backend,
         antialiased=renderer.antialiased,
         background=renderer.background,
+        origin=system.origin,
     )
 
 

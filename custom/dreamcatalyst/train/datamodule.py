@@ -13,11 +13,13 @@ from torch.utils.data import DataLoader, IterableDataset
 from .. import plugin
 from ..config import parse
 from ..data.inria import beside as cameras_beside
+from ..data.origin import ZERO, Origin
 from ..data.views import Capture, CaptureOptions, open_capture, views_for_step
 from ..demo.capture import PREFIX, world_capture
 from ..demo.worlds import World, make_world
 from ..errors import ConfigError
 from ..scene.gaussians import Gaussians
+from ..scene.ply import ply_origin
 
 
 class StepViews(IterableDataset):
@@ -82,6 +84,15 @@ class SplatData(plugin.pl.LightningDataModule):
         for notice in self.capture.notices:
             plugin.info(notice)
         return self.capture
+
+    def origin(self, splats: str = "") -> Origin:
+        """The point of the files' world that is (0,0,0) in this run, the same for cameras and splats: of the capture,
+        or where there is none, of the PLY `splats`."""
+        if self.world is not None or not (self.cfg.source or splats):
+            return ZERO
+        if self.cfg.source or cameras_beside(Path(splats)) is not None:
+            return self.open(None, splats).origin
+        return ply_origin(splats)
 
     @property
     def held_out(self) -> list[int]:

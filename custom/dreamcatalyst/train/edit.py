@@ -121,7 +121,7 @@ class EditSystem(SplatSystem):
         self.prepare()
         super().setup(stage)
         if stage == "fit":
-            write_ply(self.save_path("source.ply"), self.source.to("cpu"))
+            write_ply(self.save_path("source.ply"), self.source.to("cpu"), origin=self.origin)
             self.compare_with_photos()
 
     def describe(self, draft: Draft) -> None:
@@ -143,7 +143,7 @@ class EditSystem(SplatSystem):
                 )
             self.perceptual = Lpips(losses.perceptual_weights, self.root_device, "system.loss.perceptual_weights")
         if self.source is None:
-            given = self.given_scene() if not self.cfg.original else read_ply(self.cfg.original)
+            given = self.given_scene() if not self.cfg.original else read_ply(self.cfg.original, origin=self.origin)
             self.source = given.to(self.root_device)
             # Splats of one's own are another scene, and a prior that is exact has a truth of its own.
             whole = not (self.cfg.gs_source or self.cfg.original or self.guidance.prior.exact)

@@ -116,7 +116,7 @@ class SplatSystem(plugin.BaseSystem):
     def given_scene(self) -> Gaussians:
         """The splats of gs_source, or of the made world. Raises ConfigError where there are neither."""
         if self.cfg.gs_source:
-            return read_ply(self.cfg.gs_source, drop_nonfinite=self.cfg.drop_nonfinite)
+            return read_ply(self.cfg.gs_source, drop_nonfinite=self.cfg.drop_nonfinite, origin=self.origin)
         if self.data.world is not None:
             return self.data.world.scene
         raise ConfigError(
@@ -134,6 +134,11 @@ class SplatSystem(plugin.BaseSystem):
         if self.data.capture is None:
             self.data.open(self.splats.scene.detach() if self.splats else None, self.cfg.gs_source)
         return self.data.capture
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """The point of the files' world that is (0,0,0) in this run."""
+        return self.data.origin(self.cfg.gs_source)
 
     @property
     def root_device(self) -> torch.device:
@@ -340,7 +345,7 @@ class SplatSystem(plugin.BaseSystem):
     def write_splats(self, name: str) -> Path:
         """Write the splats of the moment as a 3DGS PLY under the save folder."""
         path = self.save_path(name)
-        write_ply(path, self.splats.scene.detach().to("cpu"))
+        write_ply(path, self.splats.scene.detach().to("cpu"), origin=self.origin)
         return path
 
     def save_now(self) -> list[Path]:
