@@ -13,6 +13,8 @@ from dreamcatalyst.guidance.guidance import NOISES
 from dreamcatalyst.guidance.rules import RULES, get_rule
 from dreamcatalyst.guidance.timesteps import POLICIES, Schedule
 from dreamcatalyst.render.api import BACKENDS
+from dreamcatalyst.scene.generations import ANCHORS
+from dreamcatalyst.segment.api import SEGMENTERS
 
 ROOT = Path(__file__).resolve().parents[2]
 GRADIENT_RULES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
@@ -91,6 +93,8 @@ def test_the_readme_lists_every_choice():
         "system.guidance.rule": set(RULES.names()),
         "system.guidance.timesteps": set(POLICIES.names()),
         "system.guidance.noise": set(NOISES),
+        "system.mask.kind": {"none", *SEGMENTERS.names()},
+        "system.anchor.kind": {"none", *ANCHORS},
         "system.renderer.backend": {"auto", *BACKENDS.names()},
     }
 
