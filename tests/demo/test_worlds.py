@@ -96,6 +96,13 @@ def test_an_unknown_world_is_named():
         make_world("stature")
 
 
+def test_a_world_of_another_seed_is_named_with_it():
+    small = {"views": 2, "size": 8}
+    assert torch.equal(make_world("random:7", **small).scene.means, make_world("random", seed=7, **small).scene.means)
+    with pytest.raises(ConfigError, match="data.source: got the world 'random:x', expected a whole number"):
+        make_world("random:x")
+
+
 def test_a_world_is_a_plain_scene(world):
     assert isinstance(world.scene, Gaussians) and list(world.scene.extra) == ["part"]
     for name in PARAMETERS:

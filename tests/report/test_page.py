@@ -86,3 +86,11 @@ def test_a_plot_is_a_file_of_its_own():
     root = ElementTree.fromstring(text)  # well-formed
     assert root.tag == "{http://www.w3.org/2000/svg}svg" and len(root.findall("{*}svg")) == 2
     assert "url(" not in text and "href" not in text
+
+
+def test_a_band_lies_behind_its_line_and_within_the_plot():
+    low, up = [(0, 1.0), (2, 0.5)], [(0, 1.0), (2, 9.5)]
+    chart = line_chart("PSNR", {"a": [(0, 1.0), (2, 3.5)], "b": [(0, 1.0), (2, 3.0)]}, bands={"b": (low, up)})
+    assert chart.index("<polygon") < chart.index("<polyline") and chart.count('<g class="c1"><polygon') == 1
+    corners = [tuple(map(float, pair.split(","))) for pair in re.search(r'polygon points="([^"]*)"', chart)[1].split()]
+    assert corners[0] == corners[3] and corners[2][1] < corners[1][1] and min(v for _, v in corners) > 0

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..data.camera import Cameras, look_at
-from ..errors import choose
+from ..errors import ConfigError, choose
 from ..registry import Registry
 from ..scene.gaussians import Gaussians
 from .shapes import Light, disc, dome, ellipsoid, speckle, surface
@@ -171,8 +171,12 @@ WORLDS.add("random", ".random_world:random_world")
 
 
 def make_world(name: str, where: str = "data.source", **options) -> World:
-    """The world called `name` (registered in WORLDS). Raises ConfigError naming the nearest known one."""
-    return WORLDS.get(name, where)(**options)
+    """The world called `name` (registered in WORLDS), or that of another seed: random:7. Raises ConfigError naming the
+    nearest known one."""
+    kind, colon, seed = name.partition(":")
+    if colon and not seed.isdecimal():
+        raise ConfigError(f"{where}: got the world '{name}', expected a whole number after the colon: {kind}:7")
+    return WORLDS.get(kind, where)(**options, **({"seed": int(seed)} if colon else {}))
 
 
 def part_mask(scene: Gaussians, *names: str) -> Tensor:

@@ -23,6 +23,7 @@ CHART_STYLE = """
 svg text{fill:var(--soft);font-size:11px}svg text.title{fill:var(--ink);font-size:13px;font-weight:600}
 svg .grid{stroke:var(--line)}svg circle{fill:var(--c)}
 svg polyline{fill:none;stroke:var(--c);stroke-width:1.8;stroke-linejoin:round}
+svg polygon{fill:var(--c);opacity:.15}
 """
 
 Points = Sequence[tuple[float, float]]
@@ -38,10 +39,17 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
     return [round(k * step, 12) for k in range(first, max(last, first + 1) + 1)]
 
 
-def line_chart(title: str, series: Mapping[str, Points], xlabel: str = "seconds", log: bool = False) -> str:
+def line_chart(
+    title: str,
+    series: Mapping[str, Points],
+    xlabel: str = "seconds",
+    log: bool = False,
+    bands: Mapping[str, tuple[Points, Points]] | None = None,
+) -> str:
     """An <svg> with one line for each series, or "" where no series has two finite points.
 
     log: the vertical axis is logarithmic; points at or below zero are left out.
+    bands: of some series, the lower and the upper edge of a band behind the line; finite, and positive where log.
     """
     usable = {
         name: [(x, y) for x, y in points if math.isfinite(y) and (y > 0 or not log)] for name, points in series.items()
@@ -50,7 +58,9 @@ def line_chart(title: str, series: Mapping[str, Points], xlabel: str = "seconds"
     if not usable:
         return ""
     high = (lambda y: math.log10(y)) if log else (lambda y: y)
-    xs, ys = zip(*((x, high(y)) for points in usable.values() for x, y in points), strict=True)
+    edges = {name: [*low, *reversed(up)] for name, (low, up) in (bands or {}).items() if name in usable}
+    drawn = [*usable.values(), *edges.values()]
+    xs, ys = zip(*((x, high(y)) for points in drawn for x, y in points), strict=True)
     across, up = ticks(min(0.0, *xs), max(xs)), (_decades if log else ticks)(min(ys), max(ys))
     key, top = _key(title, list(usable))
 
@@ -69,8 +79,12 @@ def line_chart(title: str, series: Mapping[str, Points], xlabel: str = "seconds"
         u = place(x, up[0])[0]
         parts.append(f'<text x="{u:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{x:g}</text>')
     parts.append(f'<text x="{(LEFT + WIDTH) / 2}" y="{HEIGHT - 4}" text-anchor="middle">{escape(xlabel)}</text>')
-    for number, (name, points) in enumerate(usable.items()):
-        parts.append(_line(name, points, [place(x, high(y)) for x, y in points], number % COLOURS))
+    numbered = {name: number % COLOURS for number, name in enumerate(usable)}
+    for name, points in edges.items():
+        corners = " ".join(f"{u:.1f},{v:.1f}" for u, v in (place(x, high(y)) for x, y in points))
+        parts.append(f'<g class="c{numbered[name]}"><polygon points="{corners}"/></g>')
+    for name, points in usable.items():
+        parts.append(_line(name, points, [place(x, high(y)) for x, y in points], numbered[name]))
     return "".join([*parts, "</svg>"])
 
 

@@ -1,0 +1,108 @@
+"""docs/error-vs-time.md: what is generated is written anew between two marks, and all around it is left alone."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from dreamcatalyst.report.chart import line_chart, picture_file
+
+from .cells import Bench, Cell, Lookup, Row, Settings, finished
+from .curves import Track
+from .tables import (
+    FAST,
+    HIGH,
+    ablation_table,
+    case_table,
+    claims_table,
+    ratio_table,
+    run_table,
+    tracks_of,
+    tuning_table,
+)
+
+BEGIN, END = (
+    "<!-- generated: --write replaces everything down to the next mark -->",
+    "<!-- end of what is generated -->",
+)
+NEW = f"""# Error against run time
+
+`python benchmarks/error_vs_time.py --write` runs what its budget allows (90 minutes; a further call goes on) and writes
+tables and plots here, between two marks.
+
+## What holds of the paper's claims here
+
+## Measured
+
+{BEGIN}
+{END}
+"""
+PANELS = {  # of an edit's plot: as many lines as there are colours
+    "methods": (FAST, HIGH, "pds", "pds-decreasing", "dds", "in2n"),
+    "variants": (HIGH, "dreamcatalyst-psi2", "dreamcatalyst-psi3", "csd-like", "sds", "known-edit"),
+    "three times as long": (HIGH, "pds long", "in2n long"),
+}
+OTHERS = ("pds", "pds-decreasing", "dds", "sds", "csd-like", "in2n", "dreamcatalyst-psi2", "dreamcatalyst-psi3")
+
+
+def plot(title: str, tracks: Mapping[str, Track | None]) -> str:
+    """Error against seconds of one edit as an SVG: medians, and bands from the lowest to the highest seed."""
+    charts = []
+    for name, labels in PANELS.items():
+        there = {label: curve for label in labels if (curve := tracks.get(label)) is not None}
+        bands = {
+            label: tuple(list(zip(curve.seconds, edge, strict=True)) for edge in (curve.low, curve.high))
+            for label, curve in there.items()
+            if curve.runs > 1
+        }
+        if set(there) - {HIGH}:
+            lines = {label: curve.points for label, curve in there.items()}
+            charts.append(line_chart(f"{title}, {name}: PSNR, dB", lines, bands=bands))
+    return picture_file(charts)
+
+
+def bench_parts(settings: Settings, bench: Bench, entries: Sequence[tuple[Cell, Row]], path: Path) -> list[str]:
+    """The sections of one bench; its plots are written beside `path`."""
+    tracks, parts = tracks_of(entries, "methods", bench.name), [f"### {bench.title}"]
+    instructions = {case.name: case.instruction for case in bench.cases}
+    for case, methods in tracks.items():
+        if any(methods.values()):
+            file = path.with_name(f"{path.stem}-{bench.name}-{case}.svg")
+            file.write_text(plot(instructions[case], methods), encoding="utf-8")
+            parts += [f"**{instructions[case]}**", f"![PSNR against seconds]({file.name})", case_table(methods)]
+    if tracks:
+        parts += ["**Time to the same error**, in units of DreamCatalyst's:", ratio_table(tracks, OTHERS)]
+        parts += ["**The paper's claims:**", claims_table(tracks)]
+    ablations = tracks_of(entries, "ablations", bench.name)
+    if ablations:
+        parts += ["**Ablations:**", ablation_table(ablations)]
+    return parts
+
+
+def generated(settings: Settings, lookup: Lookup, left_out: Sequence[str], path: Path) -> str:
+    """Everything between the marks."""
+    entries = finished(settings, lookup)
+    parts = [run_table(settings, entries)]
+    parts += [f"Left out: {reason}." for reason in left_out]
+    machines = {tuple(row["machine"].items()): row["versions"] for _, row in entries if "machine" in row}
+    for machine, versions in machines.items():
+        parts += [", ".join(f"{name} {value}" for name, value in (*machine, *versions.items())) + "."]
+    for bench in settings.benches:
+        parts += bench_parts(settings, bench, entries, path)
+    if settings.trials:
+        for bench in settings.benches:
+            parts += [f"### What was tuned: {bench.title}", tuning_table(settings, bench, lookup)]
+    return "\n\n".join(parts)
+
+
+def write(path: Path, settings: Settings, lookup: Lookup, left_out: Sequence[str]) -> None:
+    """Write the document; of one that is there, only what stands between the marks."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = path.read_text(encoding="utf-8") if path.exists() else NEW
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        sys.exit(f"{path}: the marks are missing. Put these two lines where tables belong:\n{BEGIN}\n{END}")
+    made = generated(settings, lookup, left_out, path)
+    path.write_text(f"{before}{BEGIN}\n\n{made}\n\n{END}{after}", encoding="utf-8")
