@@ -1,6 +1,6 @@
 """The launcher: parse, choose the device, build, run. It takes threestudio's flags and leaves threestudio's folders.
 
-python launch.py --config configs/dc-ge.yaml system.prompt_processor.prompt="Make it sunset"
+python launch.py --config configs/closed-form.yaml system.prompt_processor.prompt="Make it sunset"
 """
 
 from __future__ import annotations
