@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
+from dreamcatalyst import plugin
+from dreamcatalyst.config import check, load_config, parse
 from dreamcatalyst.demo.edits import find_edit, possible
 from dreamcatalyst.demo.random_world import HELD_OUT
 from dreamcatalyst.demo.worlds import make_world
+from dreamcatalyst.diffusion.api import PRIORS
 from dreamcatalyst.guidance.fixed_point import fixed_point
 from dreamcatalyst.guidance.guidance import GuidanceConfig, chosen_rule, chosen_schedule
 from dreamcatalyst.guidance.rules import RULES
@@ -103,6 +107,12 @@ def test_tuning_comes_first_and_seeds_last():
     first = [(cell.case, cell.label) for cell in order[6:12]]
     names = ("dreamcatalyst fast", "dreamcatalyst", "pds")
     assert first == [(case, name) for case in ("panda", "snow") for name in names]
+
+
+def test_what_says_most_is_tuned_and_run_before_the_rest_is():
+    more = replace(bench(), families=("sds", "pds", "dreamcatalyst"))
+    order = [cell.label for cell in Results().run_all(cells.Settings((more,), trials=2, ablations=False))]
+    assert order.index("pds") < order.index("pds long") < order.index("sds +0 +0") < order.index("sds")
 
 
 def test_edits_of_several_benches_come_in_turn():
@@ -217,7 +227,7 @@ def test_the_papers_ratios_are_its_steps_times_our_costs():
     seconds = {"dreamcatalyst fast": 10, "dreamcatalyst": 10, "pds": 8}  # of equally many steps
     tracks = {"panda": {name: curves.track([line(10, 20, seconds=value)]) for name, value in seconds.items()}}
     rows = [row.split(" | ") for row in tables.claims_table(tracks).splitlines()[2:]]
-    assert [row[1:4] for row in rows] == [["23", "24", "0.8"], ["8", "8", "0.8"], ["1.85", "-", "-"]]
+    assert [row[1:4] for row in rows] == [["23", "24", "0.8"], ["8", "8", "0.8"]]  # there is no run of in2n
 
 
 # --- the document
@@ -290,6 +300,25 @@ def test_a_key_is_of_values_and_contents(tmp_path):
     splats.write_bytes(b"two")
     assert key() != first
     json.dumps(runner.settings_of(cells.Cell("methods", "b", "c", "l", 0, str(config), ())))
+
+
+@pytest.mark.parametrize("name", ["dc-ge-ip2p", "closed-form"])
+def test_every_setting_of_every_run_is_known_to_its_system(name):
+    path, place = (
+        str(error_vs_time.ROOT / "configs" / f"{name}.yaml"),
+        ("data.source=demo:statue", "system.gs_source=''"),
+    )
+    words = (*place, "system.prompt_processor.prompt=Make it sunset")
+    values, families = error_vs_time.values_of(path, list(words)), tuple(cells.FAMILIES)
+    scales = dict.fromkeys(families, 7.5) if name == "closed-form" else {}
+    made = replace(bench(), config=path, values=values, families=families, overrides=place, scales=scales)
+    order = Results().run_all(cells.Settings((made,), seeds=(0,), trials=0, ablations=not scales))
+    for cell in {cell.label: cell for cell in order if cell.label in (*families, *cells.ABLATIONS)}.values():
+        config = load_config(cell.config, cli_args=[*cell.overrides, *runner.QUIET])
+        check(plugin.find("dreamcatalyst-data"), config.data, "data")
+        guidance = check(plugin.find("dreamcatalyst-edit-system"), config.system, "system")["guidance"]
+        parse(PRIORS.get(guidance.prior_type).Config, guidance.prior, "system.guidance.prior")
+        assert chosen_schedule(guidance, chosen_rule(guidance)).limits[1] <= 0.98
 
 
 # --- what is asked of priors

@@ -65,15 +65,15 @@ METHODS = (
     Method("in2n", "in2n"),
     Method("dds", "dds"),
     Method("known-edit", "known-edit"),
-    Method("pds-decreasing", "pds-decreasing", tier=1),
-    Method("dreamcatalyst-psi2", "dreamcatalyst-psi2", tier=1),
-    Method("dreamcatalyst-psi3", "dreamcatalyst-psi3", tier=1),
-    Method("csd-like", "csd-like", tier=1),
-    Method("sds", "sds", tier=1),
-    Method("dreamcatalyst-psi2 fast", "dreamcatalyst-psi2", "fast", tier=1),
-    Method("dreamcatalyst-psi3 fast", "dreamcatalyst-psi3", "fast", tier=1),
-    Method("pds long", "pds", length=3.0, tier=2),
-    Method("in2n long", "in2n", length=3.0, tier=2),
+    Method("pds long", "pds", length=3.0, tier=1),
+    Method("in2n long", "in2n", length=3.0, tier=1),
+    Method("pds-decreasing", "pds-decreasing", tier=2),
+    Method("dreamcatalyst-psi2", "dreamcatalyst-psi2", tier=2),
+    Method("dreamcatalyst-psi3", "dreamcatalyst-psi3", tier=2),
+    Method("csd-like", "csd-like", tier=2),
+    Method("sds", "sds", tier=2),
+    Method("dreamcatalyst-psi2 fast", "dreamcatalyst-psi2", "fast", tier=2),
+    Method("dreamcatalyst-psi3 fast", "dreamcatalyst-psi3", "fast", tier=2),
 )
 
 FREEU, ANCHOR, DENSIFY, MASK = f"{GUIDANCE}prior.freeu", "system.anchor.kind", "system.densify.every", "system.mask"
@@ -214,52 +214,43 @@ def score(row: Row) -> float:
     return -math.inf if row.get("failed") else row["error"][-1]
 
 
-def tuning_cells(settings: Settings, lookup: Lookup) -> Iterator[Cell]:
-    """The trials that are still to be run, families in turn."""
+def tuning_cells(settings: Settings, families: Sequence[str], lookup: Lookup) -> Iterator[Cell]:
+    """The trials of `families` that are still to be run, in turn."""
     for turn in range(settings.trials):
         for bench in settings.benches:
             for family in bench.families:
                 tried, point = searched(settings, bench, family, lookup)
-                if point is not None and len(tried) == turn:  # after an interruption the others catch up first
+                if family in families and point is not None and len(tried) == turn:  # who is behind catches up first
                     yield from trial_cells(bench, family, point)
 
 
 # --- the table
 
 
-def main_cells(settings: Settings, lookup: Lookup) -> Iterator[Cell]:
-    """All runs of methods and ablations that are tuned: seeds last, before them what says less, edits in turn."""
-    tuned: dict[tuple[str, str], Point] = {}
-    for bench in settings.benches:
-        for family in bench.families:
-            tried, missing = searched(settings, bench, family, lookup)
-            if missing is None:
-                tuned[bench.name, family] = best(tried)
-    tiers = sorted({method.tier for method in settings.methods})
-    for seed in settings.seeds:
-        for tier in tiers:
-            yield from method_cells(settings, seed, tier, tuned)
-        if settings.ablations:
-            yield from ablation_cells(settings, seed, tuned)
-
-
-def method_cells(settings: Settings, seed: int, tier: int, tuned: Mapping[tuple[str, str], Point]) -> Iterator[Cell]:
-    """Every method of a tier on every edit, once."""
+def method_cells(settings: Settings, methods: Sequence[Method], seed: int, lookup: Lookup) -> Iterator[Cell]:
+    """Every one of `methods` that is tuned on every edit, once."""
     for bench, case in cases_in_turn(settings):
-        for method in settings.methods:
-            if method.tier == tier and (bench.name, method.family) in tuned:
-                point = tuned[bench.name, method.family]
+        for method in methods:
+            if (point := tuned(settings, bench, method.family, lookup)) is not None:
                 overrides = adjusted(bench, method.family, method.mode, method.length, point)
                 yield make_cell("methods", bench, case, method.name, seed, overrides)
 
 
-def ablation_cells(settings: Settings, seed: int, tuned: Mapping[tuple[str, str], Point]) -> Iterator[Cell]:
+def ablation_cells(settings: Settings, seed: int, lookup: Lookup) -> Iterator[Cell]:
     """Every ablation, once."""
-    for bench, case in cases_in_turn(settings):
-        if case.ablated and (bench.name, "dreamcatalyst") in tuned:
-            base = adjusted(bench, "dreamcatalyst", "high-quality", 1.0, tuned[bench.name, "dreamcatalyst"])
+    for bench, case in cases_in_turn(settings) if settings.ablations else ():
+        if case.ablated and (point := tuned(settings, bench, "dreamcatalyst", lookup)) is not None:
+            base = adjusted(bench, "dreamcatalyst", "high-quality", 1.0, point)
             for name, overrides in ABLATIONS.items():
                 yield make_cell("ablations", bench, case, name, seed, (*base, *overrides))
+
+
+def tuned(settings: Settings, bench: Bench, family: str, lookup: Lookup) -> Point | None:
+    """What the search of a family came to; None where it is not at its end, or the bench has no such family."""
+    if family not in bench.families:
+        return None
+    tried, missing = searched(settings, bench, family, lookup)
+    return best(tried) if missing is None else None
 
 
 def cases_in_turn(settings: Settings) -> list[tuple[Bench, Case]]:
@@ -269,10 +260,18 @@ def cases_in_turn(settings: Settings) -> list[tuple[Bench, Case]]:
 
 
 def remaining(settings: Settings, lookup: Lookup) -> Iterator[Cell]:
-    """What is still to be run, in order. Each is to be run before the next one is asked for: what is tuned next, and
-    with which settings methods run, follows from what came out."""
-    for cells in (tuning_cells, main_cells):
-        yield from (cell for cell in cells(settings, lookup) if lookup(cell) is None)
+    """What is still to be run, in order: tier by tier, its tuning first; then ablations; then the same with the further
+    seeds. Each cell is to be run before the next one is asked for: what follows depends on what came out."""
+
+    def everything() -> Iterator[Cell]:
+        for seed in settings.seeds:
+            for tier in sorted({method.tier for method in settings.methods}):
+                methods = [method for method in settings.methods if method.tier == tier]
+                yield from tuning_cells(settings, [method.family for method in methods], lookup)
+                yield from method_cells(settings, methods, seed, lookup)
+            yield from ablation_cells(settings, seed, lookup)
+
+    return (cell for cell in everything() if lookup(cell) is None)
 
 
 def finished(settings: Settings, lookup: Lookup) -> list[tuple[Cell, Row]]:
@@ -282,7 +281,9 @@ def finished(settings: Settings, lookup: Lookup) -> list[tuple[Cell, Row]]:
         for family in bench.families:
             for point in searched(settings, bench, family, lookup)[0]:
                 cells += trial_cells(bench, family, point)
-    cells += main_cells(settings, lookup)
+    for seed in settings.seeds:
+        cells += method_cells(settings, settings.methods, seed, lookup)
+        cells += ablation_cells(settings, seed, lookup)
     return [(cell, row) for cell in cells if (row := lookup(cell)) is not None]
 
 

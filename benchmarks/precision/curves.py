@@ -81,6 +81,11 @@ def levels(tracks: Sequence[Track], shares: Sequence[float] = (0.5, 0.75, 0.9)) 
     return [start + share * (end - start) for share in shares]
 
 
+def times(value: float) -> str:
+    """A ratio in words: two digits, and no exponent."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
 @dataclass(frozen=True)
 class Ratio:
     """How many times as long one takes as another. reached: else it is a lower bound, the whole run."""
@@ -89,7 +94,7 @@ class Ratio:
     reached: bool = True
 
     def __str__(self) -> str:
-        return f"{self.value:.2g}" if self.reached else f"> {self.value:.2g}"
+        return f"{'' if self.reached else '> '}{times(self.value)}"
 
 
 def ratio(reference: Track, others: Sequence[Track]) -> Ratio | None:
@@ -99,9 +104,9 @@ def ratio(reference: Track, others: Sequence[Track]) -> Ratio | None:
     mine = reach(reference, target)
     if not mine:
         return None
-    times = [seconds for curve in others if (seconds := reach(curve, target)) is not None]
-    if times:
-        return Ratio(min(times) / mine)
+    theirs = [seconds for curve in others if (seconds := reach(curve, target)) is not None]
+    if theirs:
+        return Ratio(min(theirs) / mine)
     return Ratio(max(curve.seconds[-1] for curve in others) / mine, reached=False)
 
 

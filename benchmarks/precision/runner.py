@@ -34,7 +34,7 @@ class Runner:
     """Results by key. file: JSON lines, one a cell; folder: where runs lie until they are read, and masks are kept."""
 
     def __init__(self, file: Path, folder: Path):
-        self.file, self.folder = file, folder
+        self.file, self.folder = file, folder.resolve()
         lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
         self.rows: dict[str, dict[str, Any]] = {row["key"]: row for row in map(json.loads, lines)}
         self.ran: list[dict[str, Any]] = []  # in this call

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 
 from .cells import ABLATIONS, Bench, Cell, Row, Settings, planned, searched
-from .curves import Ratio, Track, levels, middle, ratio, reach, track
+from .curves import Ratio, Track, levels, middle, ratio, reach, times, track
 from .search import RATE, SCALE, best
 
 FAST, HIGH = "dreamcatalyst fast", "dreamcatalyst"
@@ -46,18 +46,18 @@ def case_table(tracks: Mapping[str, Track | None]) -> str:
     head = ["method", "ends at, dB", "outside, dB", "s per step", "s", *(f"s to {goal:.1f} dB" for goal in goals)]
     rows = []
     for name, curve in sorted(there.items(), key=lambda item: -item[1].error[-1]):
-        times = [reach(curve, goal) for goal in goals]
+        arrivals = [reach(curve, goal) for goal in goals]
         cells = [f"{name}{f' ({curve.failed} failed)' if curve.failed else ''}", spread(curve)]
         cells += ["-" if curve.outside is None else f"{curve.outside:.1f}"]
         cells += [f"{curve.per_step:.3f}", f"{curve.seconds[-1]:.1f}"]
-        rows.append([*cells, *("-" if time is None else f"{time:.1f}" for time in times)])
+        rows.append([*cells, *("-" if time is None else f"{time:.1f}" for time in arrivals)])
     rows += [[name, "failed", *["-"] * (len(head) - 2)] for name, curve in tracks.items() if curve is None]
     return markdown(head, rows)
 
 
 def lengths(tracks: Mapping[str, Track | None], name: str) -> list[Track]:
-    """The curves of a method at all its lengths."""
-    return [curve for each in (name, f"{name} long") if (curve := tracks.get(each)) is not None]
+    """The curves of a method at all its lengths, the longest last."""
+    return [curve for each in (f"{name} fast", name, f"{name} long") if (curve := tracks.get(each)) is not None]
 
 
 def ratios(tracks: Tracks, reference: str, other: str) -> dict[str, Ratio]:
@@ -89,10 +89,11 @@ def claims_table(tracks: Tracks) -> str:
         for methods in tracks.values():
             mine, others = methods.get(reference), lengths(methods, other)
             costs += [others[-1].per_step / mine.per_step] if mine is not None and others else []
-        scaled = f"{median(costs) * steps / own:.2g}" if costs else "-"
-        found = ratios(tracks, reference, other).values()
-        came = f"{sum(r.reached for r in found)} of {len(found)}"
-        rows.append([f"{reference} against {other}", claim, scaled, middle(list(found)) or "-", came])
+        if costs:
+            found = ratios(tracks, reference, other).values()
+            came = f"{sum(r.reached for r in found)} of {len(found)}"
+            scaled = times(median(costs) * steps / own)
+            rows.append([f"{reference} against {other}", claim, scaled, middle(list(found)) or "-", came])
     head = ["claim: times as fast", "paper", "at its numbers of steps", "to the same error", "edits that come there"]
     return markdown(head, rows)
 
