@@ -98,7 +98,7 @@ def bench_parts(settings: Settings, bench: Bench, entries: Sequence[tuple[Cell, 
     ablations = tracks_of(entries, "ablations", bench.name)
     if ablations:
         parts += ["**Ablations:**", ablation_table(ablations)]
-    return parts
+    return parts if len(parts) > 1 else []
 
 
 def generated(settings: Settings, lookup: Lookup, left_out: Sequence[str], path: Path) -> str:
