@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent
-# Threads that wait sleep instead of spinning, unless the user says otherwise: where something else wants the cores, too,
-# spinning takes them from the very thread that is waited for, and a step takes up to twice as long.
+# Threads that wait sleep instead of spinning, unless the user says otherwise: where something else wants the cores,
+# too, spinning takes them from the very thread that is waited for, and a step takes up to twice as long.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 INTERRUPTED = 130  # the exit status of a shell command that Ctrl-C ended
 
