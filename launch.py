@@ -21,8 +21,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent
 # Threads that wait soon sleep instead of spinning on (GNU OpenMP spins six times as long), unless the user says
-# otherwise: where something else wants the cores, spinning takes them from the very thread that is waited for. At this
-# count a step takes as long as before on quiet cores, and mostly half as long on shared ones.
+# otherwise: where something else wants the cores, spinning takes them from the very thread that is waited for.
 os.environ.setdefault("GOMP_SPINCOUNT", "50000")
 INTERRUPTED = 130  # the exit status of a shell command that Ctrl-C ended
 

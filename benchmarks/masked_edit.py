@@ -78,7 +78,7 @@ def area_table(n: int, side: int, repeats: int) -> dict[float, float]:
         print(
             f"{area:7.0%} {editable.double().mean():9.1%} {forward:8.1f} {backward:9.1f}"
             f" {1e3 * median(map(sum, ours)):10.1f} {1e3 * median(theirs):8.1f} {ratios[area]:14.2f}"
-            f" {frozen.held / 2**20:15.1f} {training_bytes(scene, editable) / 2**20:13.1f}"
+            f" {frozen.kept.bytes / 2**20:15.1f} {training_bytes(scene, editable) / 2**20:13.1f}"
         )
     return ratios
 

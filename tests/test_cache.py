@@ -34,3 +34,14 @@ def test_what_is_too_large_is_handed_out_and_not_kept():
     assert (len(cache), cache.bytes) == (1, 1024)
     cache.clear()
     assert (len(cache), cache.bytes) == (0, 0)
+
+
+def test_what_is_put_takes_the_place_of_what_was_there():
+    cache = ByteCache(2500)
+    cache.put("a", kilobyte())
+    cache.put("b", kilobyte())
+    again = torch.zeros(300)
+    cache.put("a", again)  # and is the latest
+    assert cache.find("a") is again and cache.bytes == 1024 + 1200
+    cache.put("b", torch.zeros(1000))  # too large: gone, and nothing goes for it
+    assert cache.find("b") is None and cache.find("a") is again and cache.bytes == 1200

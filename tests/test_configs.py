@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
 from dreamcatalyst.config import load_config
 from dreamcatalyst.errors import ConfigError
@@ -49,15 +48,11 @@ def overrides(path: str, models: dict[str, Path], folder: Path) -> list[str]:
     return [*given, *SMALL]
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("path", sorted(CONFIGS))
 def test_every_config_runs_a_step(path, models, tmp_path):
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        options = [f"exp_root_dir={tmp_path}", "trainer.fast_dev_run=true", "trainer.accelerator=cpu"]
-        assert launch.main(["--config", str(ROOT / path), *overrides(path, models, tmp_path), *options]) == 0
-    finally:
-        torch.set_num_threads(threads)
+    options = [f"exp_root_dir={tmp_path}", "trainer.fast_dev_run=true", "trainer.accelerator=cpu"]
+    assert launch.main(["--config", str(ROOT / path), *overrides(path, models, tmp_path), *options]) == 0
     assert list(tmp_path.rglob("*.ply")) or list(tmp_path.rglob("*.safetensors"))
 
 

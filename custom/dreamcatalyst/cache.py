@@ -31,18 +31,31 @@ class ByteCache:
     def __len__(self) -> int:
         return len(self._held)
 
+    def find(self, key: Hashable) -> Any:
+        """The value of `key`, None where it is not held."""
+        if key not in self._held:
+            return None
+        self._held.move_to_end(key)
+        return self._held[key][0]
+
+    def put(self, key: Hashable, value: Any) -> None:
+        """Hold `value` under `key`, in place of what was there, as far as the limit allows."""
+        if key in self._held:
+            self.bytes -= self._held.pop(key)[1]
+        size = self._size(value)
+        if size > self.limit:
+            return
+        self._held[key] = value, size
+        self.bytes += size
+        while self.bytes > self.limit:
+            self.bytes -= self._held.popitem(last=False)[1][1]
+
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
         """The value of `key`, made where it is not held."""
-        if key in self._held:
-            self._held.move_to_end(key)
-            return self._held[key][0]
-        value = make()
-        size = self._size(value)
-        if size <= self.limit:
-            self._held[key] = value, size
-            self.bytes += size
-            while self.bytes > self.limit:
-                self.bytes -= self._held.popitem(last=False)[1][1]
+        value = self.find(key)
+        if value is None:
+            value = make()
+            self.put(key, value)
         return value
 
     def clear(self) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 
 import numba
-import numpy as np
 import pytest
 import torch
 from dreamcatalyst.data.camera import Cameras
@@ -192,22 +191,22 @@ def test_results_do_not_depend_on_what_is_kept(random_scene, pinhole, rounds):
     true = [draw(s, Frozen(frozen, limit=0), cameras, backend="cpu")[:2] for s in (scene, moved)]
     one_view = Frozen(frozen)
     draw(scene, one_view, cameras[0], backend="cpu")
-    for rest in Frozen(frozen), Frozen(frozen, limit=one_view.held * 3 // 2):
+    for rest in Frozen(frozen), Frozen(frozen, limit=one_view.kept.bytes * 3 // 2):
         for number in (0, 1, 0, 1):
             got = draw((scene, moved)[number], rest, cameras, backend="cpu")[:2]
             for mine, others in zip(got, true[number], strict=True):
                 assert all(torch.equal(mine[name], others[name]) for name in mine)
-        assert 0 < rest.held <= rest.limit
+        assert 0 < rest.kept.bytes <= rest.kept.limit
 
 
 def test_one_view_is_kept_once_and_any_other_anew(random_scene, pinhole):
     (frozen, scene), camera = parts(random_scene, "among"), pinhole(40, 30)
     rest = Frozen(frozen)
     rasterize(scene, camera, frozen=rest)
-    once = rest.held
+    once = rest.kept.bytes
     assert once > 0
     rasterize(scene, camera, frozen=rest, background=torch.ones(3))
-    assert rest.held == once  # the background is put behind afterwards
+    assert rest.kept.bytes == once  # the background is put behind afterwards
     viewmats, Ks = camera.viewmats.clone(), camera.Ks.clone()
     viewmats[:, 0, 3] += 1e-3
     Ks[:, 0, 0] += 1e-3
@@ -220,25 +219,11 @@ def test_one_view_is_kept_once_and_any_other_anew(random_scene, pinhole):
         dict(antialiased=True),
     )
     for change in changes:
-        before = rest.held
+        before = rest.kept.bytes
         options = {"cameras": camera, **change}
         rgb = rasterize(scene, frozen=rest, **options).rgb
-        assert rest.held > before
+        assert rest.kept.bytes > before
         assert torch.allclose(rgb, rasterize(joined(frozen, scene), **options).rgb, atol=1e-6)
-
-
-def test_least_recently_used_is_dropped(random_scene):
-    rest = Frozen(random_scene(1), limit=100)
-    things = {name: np.zeros(40, np.uint8) for name in "abc"}
-    rest.put("a", things["a"])
-    rest.put("b", things["b"])
-    assert rest.get("a") is things["a"]
-    rest.put("c", things["c"])  # b was not used for longest
-    assert rest.get("b") is None and rest.get("a") is things["a"] and rest.get("c") is things["c"] and rest.held == 80
-    rest.put("d", np.zeros(101, np.uint8))  # larger than the limit: not kept, and nothing goes for it
-    assert rest.get("d") is None and rest.held == 80
-    rest.put("a", np.zeros(50, np.uint8))  # in place of the old one
-    assert rest.held == 90 and rest.get("c") is things["c"]
 
 
 def test_no_gradient_is_no_obstacle(random_scene, pinhole):

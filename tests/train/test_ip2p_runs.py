@@ -9,6 +9,7 @@ from dreamcatalyst.scene.ply import read_ply
 
 from tests.diffusion.small_model import make_model
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 ODD = ["data.width=27", "data.height=21", "data.max_view_num=3", "system.report.views=1", "system.report.every=0"]
 WORDS = ["system.prompt_processor.prompt=make it snow"]
 EVERY_PARAMETER = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
@@ -23,15 +24,6 @@ def models(tmp_path_factory):
 def on(models, prior_type, rule, *more):
     options = [f"system.guidance.prior_type={prior_type}", f"system.guidance.prior={{path: {models[prior_type]}}}"]
     return [*options, f"system.guidance.rule={rule}", "system.guidance.noise=independent", *WORDS, *ODD, *more]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Models as small as these lose by more."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -84,7 +84,7 @@ def test_memory_is_that_of_the_tensors(run, options):
     assert size(plan, "source") == scene_bytes(system.source)
     if splats.frozen is not None:
         assert size(plan, "frozen splats") == scene_bytes(splats.frozen)
-        assert 0 < system.frozen.held <= size(plan, "renders of frozen splats")
+        assert 0 < system.frozen.kept.bytes <= size(plan, "renders of frozen splats")
     if anchors:
         assert size(plan, "anchors") == tensor_size(*anchors)
 

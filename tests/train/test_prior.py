@@ -22,6 +22,7 @@ from dreamcatalyst.train.prior.vocabulary import WORD, learn_merges, vocabulary,
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).resolve().parents[2]
 WORDINGS = ["Turn the bear statue into a panda", "make it sunset", "Make it look like just snowed.", ""]
 SIZE = 32
@@ -31,15 +32,6 @@ SMALL = {
     "unet": {"channels": [8, 16], "attention": [False, True], "steps": 3, "minutes": None, "batch_size": 4},
     "samples": {"steps": 2, "pictures": 2, "every": 0},
 }
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Models as small as these lose by more."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

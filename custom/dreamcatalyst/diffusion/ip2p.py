@@ -28,7 +28,8 @@ OUT_OF_MEMORY = ("out of memory", "allocate memory", "not enough memory")  # no 
 @dataclass(frozen=True)
 class Ip2pConfig:
     """What to load and how to run it. The options that save memory bear the names that diffusers gives them. Effects
-    are those of `benchmarks/guidance_step.py --size sd15 --pixels 256` on two CPU cores in fp32, per step.
+    are those of `benchmarks/guidance_step.py --size sd15 --pixels 256 --options channels_last slicing tiling` on two
+    CPU cores in fp32, per step.
 
     path: a Hugging Face id, or a local folder of the same layout; demo:prior is the small one that comes along.
     dtype: precision of all weights and activations, fp32, fp16 or bf16. Latents and gradients stay the caller's; the

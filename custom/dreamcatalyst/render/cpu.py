@@ -79,12 +79,12 @@ def _frozen_view(
     size = camera.width, camera.height
     numbers = (tensor.numpy().tobytes() for tensor in (camera.viewmats, camera.Ks))
     key = "cpu", *numbers, *size, sh_degree, antialiased
-    kept = frozen.get(key)
+    kept = frozen.kept.find(key)
     if kept is None or not kept.covered[touched].all():
         *splats, radii = _splats(frozen.scene, camera, sh_degree, antialiased)
         arrays = [array[0] for array in _arrays(*splats)]
         kept = cpu_frozen.view(*arrays, radii[0].numpy(), *size, touched, kept)
-        frozen.put(key, kept)
+        frozen.kept.put(key, kept)
     return kept
 
 
