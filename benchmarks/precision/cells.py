@@ -42,6 +42,7 @@ FAMILIES: dict[str, Family] = {
     "dreamcatalyst-psi3": Family(("rule=dreamcatalyst-psi3", "timesteps=decreasing")),
     "csd-like": Family(("rule=csd-like", "timesteps=decreasing")),
     "pds-decreasing": Family(("rule=pds", "timesteps=decreasing"), (PLAIN,)),
+    "pds-implicit": Family(("rule=pds", "timesteps=uniform", "implicit_step=10"), UNIFORM),  # docs/distillation.md
     "sds": Family(("rule=sds", "timesteps=uniform"), UNIFORM),
     "known-edit": Family(("rule=known-edit",)),  # no method: what could be reached
 }
@@ -71,6 +72,7 @@ METHODS = (
     Method("dreamcatalyst-psi2", "dreamcatalyst-psi2", tier=2),
     Method("dreamcatalyst-psi3", "dreamcatalyst-psi3", tier=2),
     Method("csd-like", "csd-like", tier=2),
+    Method("pds-implicit", "pds-implicit", tier=2),
     Method("sds", "sds", tier=2),
     Method("dreamcatalyst-psi2 fast", "dreamcatalyst-psi2", "fast", tier=2),
     Method("dreamcatalyst-psi3 fast", "dreamcatalyst-psi3", "fast", tier=2),
@@ -82,6 +84,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {  # of dreamcatalyst; all say what they
     "FreeU b = 1.1": (f"{FREEU}.mode=paper", f"{FREEU}.b1=1.1", f"{FREEU}.b2=1.1"),
     "FreeU b = 1.3": (f"{FREEU}.mode=paper", f"{FREEU}.b1=1.3", f"{FREEU}.b2=1.3"),
     "anchors and densification": (f"{ANCHOR}=last-densify",),
+    "proximal anchors and densification": (f"{ANCHOR}=last-densify", "system.anchor.form=proximal"),
     "no anchors, densification": (f"{ANCHOR}=none",),
     "anchors, no densification": (f"{ANCHOR}=last-densify", f"{DENSIFY}=0"),
     "no anchors, no densification": (f"{ANCHOR}=none", f"{DENSIFY}=0"),

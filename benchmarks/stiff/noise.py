@@ -56,10 +56,11 @@ def gradient(rule: str, timestep: int, dtype: torch.dtype, rounded: torch.dtype 
     kind = Rounding if rounded is not None and dtype == torch.float64 else ClosedForm
     prior = kind(ClosedFormConfig(**options), alphas_cumprod=abar)
     text = prior.embed(["Make it sunset"])[0]
+    named = get_rule(rule, **changes.pop("parameters", {}))
     given = {"guidance_scale": 7.5, "image_guidance_scale": 1.5, "text": text, **changes}
     return distillation_gradient(
         prior,
-        get_rule(rule),
+        named,
         prior.encode(render),
         prior.encode(source),
         image=prior.condition(source),
@@ -201,6 +202,10 @@ CASES = [
         "guidance scale 1e3 of an instruction that changes nothing": nothing_new(1e3),
         "guidance scale 1e6 of an instruction that changes nothing": nothing_new(1e6),
         "weights of PDS in float32, every t": pds_in_float32,
+        **{
+            f"pds with an implicit step of {h:g}": at_levels("pds", SOME, parameters={"implicit_step": h})
+            for h in (1e-6, 1.0, 1e6)
+        },
         "abar to 1: 1 - 1e-12 at the first level": at_levels("dds", ENDS, abar=ended(low=1 - 1e-12)),
         "abar of 1 at the first level": at_levels("dreamcatalyst", ENDS, abar=ended(low=1.0)),
         "abar to 0: 1e-12 at the last level": at_levels("dreamcatalyst", ENDS, abar=ended(high=1e-12)),

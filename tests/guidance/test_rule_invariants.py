@@ -144,3 +144,29 @@ def test_the_loss_carries_the_gradient(seed, reduction):
     x, g = w.x.clone().requires_grad_(), gradient(w, "dreamcatalyst", 501)
     distillation_loss(x, g, reduction).backward()
     assert_close(x.grad, g / (x.numel() if reduction == "mean" else len(x)))
+
+
+@pytest.mark.parametrize("name", ["pds", "dreamcatalyst"])
+@given(seeds, timesteps, st.floats(1e-6, 1e6))
+@few
+def test_an_implicit_step_is_backward_euler_of_the_identity_term(name, seed, t, length):
+    """x' = x - h g obeys x' = x - h [a (eps_edit - eps_ref) + b (x' - x_src)], and so cannot pass x_src by itself."""
+    w = world(seed)
+    explicit, implicit = get_rule(name), get_rule(name, implicit_step=length)
+    a, b = explicit.weights(t, w.prior.alphas_cumprod)
+    editing = gradient(w, explicit, t) - b * (w.x - w.source)
+    after = w.x - length * gradient(w, implicit, t)
+    assert_close(after + length * b * (after - w.source), w.x - length * editing)
+    assert implicit.weights(t, w.prior.alphas_cumprod)[0] == pytest.approx(a / (1 + length * b), rel=1e-12)
+
+
+def test_a_stiff_identity_term_needs_the_implicit_step():
+    """Steps of length 1 with b = 50: explicitly each multiplies the distance from the source by -49."""
+    w = world(0)
+    left = {}
+    for length in (0.0, 1.0):
+        rule, x = get_rule("dreamcatalyst", delta=0.0, gamma=0.0, chi=50.0, implicit_step=length), w.x
+        for _ in range(5):
+            x = x - gradient(w, rule, 1, x=x)
+        left[length] = float((x - w.source).abs().max() / (w.x - w.source).abs().max())
+    assert left[0.0] == pytest.approx(49.0**5) and left[1.0] == pytest.approx(51.0**-5)

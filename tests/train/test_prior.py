@@ -15,9 +15,9 @@ from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig
 from dreamcatalyst.diffusion.noise import add_noise, stable_diffusion_schedule
 from dreamcatalyst.train.prior.folder import write_prior
 from dreamcatalyst.train.prior.judge import sampled_edits, scores
-from dreamcatalyst.train.prior.losses import min_snr_weights, noised, reconstruction_loss
+from dreamcatalyst.train.prior.losses import noised, reconstruction_loss
 from dreamcatalyst.train.prior.models import AutoencoderConfig, TextConfig, UnetConfig, make_networks
-from dreamcatalyst.train.prior.system import Progress
+from dreamcatalyst.train.prior.system import PriorSystem, Progress
 from dreamcatalyst.train.prior.vocabulary import WORD, learn_merges, vocabulary, write_tokenizer
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -117,10 +117,23 @@ def test_v_and_noisy_latents_give_back_the_clean_ones():
         assert torch.allclose((1 - a) ** 0.5 * x[i] + a**0.5 * v[i], noise[i])
 
 
-def test_min_snr_weighs_the_clean_latent_by_the_smaller_of_snr_and_gamma():
-    abar = torch.tensor([0.001, 0.5, 0.8, 0.99])
-    snr = abar / (1 - abar)
-    assert torch.allclose(min_snr_weights(abar, 5.0) * (snr + 1), torch.tensor([0.001 / 0.999, 1.0, 4.0, 5.0]))
+def test_threads_that_take_parts_of_a_batch_leave_the_gradients_of_the_whole(train, monkeypatch):
+    whole, differences = PriorSystem._unet_gradients, []
+
+    def both(self, number):
+        gradients = []
+        for threads in (1, 3):  # of a batch of 4
+            torch.set_num_threads(threads)
+            self.optimizers()[1].zero_grad()
+            value = whole(self, number)
+            gradients.append(torch.cat([p.grad.flatten() for p in self.trained("unet") if p.grad is not None]))
+        torch.set_num_threads(1)
+        differences.append(float((gradients[1] - gradients[0]).norm() / gradients[0].norm()))
+        return value
+
+    monkeypatch.setattr(PriorSystem, "_unet_gradients", both)
+    train("system.autoencoder.steps=1", "system.unet.steps=2")
+    assert len(differences) == 2 and max(differences) < 1e-5
 
 
 def test_a_wrong_colour_counts_at_every_scale_and_grain_only_at_the_finest():

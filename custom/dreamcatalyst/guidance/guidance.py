@@ -38,6 +38,7 @@ class GuidanceConfig:
     delta: float | None = None
     gamma: float | None = None
     gap: int | None = None  # of PDS, in timesteps
+    implicit_step: float | None = None  # length of a step that takes the identity term implicitly; 0: explicitly
     guidance_scale: float = 7.5  # w_y, of the instruction
     condition_scale: float = 1.5  # w_I, of the image
     timesteps: str | None = None  # policy (guidance/timesteps.py); null: the rule's own
@@ -74,7 +75,7 @@ class Step:
 
 def chosen_rule(config: GuidanceConfig) -> Rule:
     """The rule with its parameters. Raises ConfigError."""
-    given = {name: getattr(config, name) for name in ("chi", "delta", "gamma", "gap")}
+    given = {name: getattr(config, name) for name in ("chi", "delta", "gamma", "gap", "implicit_step")}
     return get_rule(config.rule, config.preset, **{k: v for k, v in given.items() if v is not None})
 
 

@@ -30,6 +30,7 @@ class Parameters:
     delta: float = 0.2  # editing: a = delta + gamma u^(1/e)
     gamma: float = 0.8
     gap: int = 2  # from t to the earlier step of PDS: 2 as published (500 of 1000 steps), 1 is the single step
+    implicit_step: float = 0.0  # length h of a step on latents that takes the identity term implicitly; 0: explicitly
 
 
 PRESETS: dict[str, Parameters] = {
@@ -148,8 +149,14 @@ class Rule:
     parameters: Parameters = field(default_factory=Parameters)
 
     def weights(self, timestep: int, alphas_cumprod: Tensor) -> tuple[float, float]:
-        """(a, b) at index `timestep` of a prior with this schedule."""
-        return self.a(self.parameters, timestep, alphas_cumprod), self.b(self.parameters, timestep, alphas_cumprod)
+        """(a, b) at index `timestep` of a prior with this schedule.
+
+        With an implicit step h, both divided by 1 + h b: x - h g then is the backward Euler step of the identity term,
+        x' = x - h [a (eps_edit - eps_ref) + b (x' - x_src)], which no b makes overshoot x_src.
+        """
+        a, b = self.a(self.parameters, timestep, alphas_cumprod), self.b(self.parameters, timestep, alphas_cumprod)
+        damping = 1.0 + self.parameters.implicit_step * b
+        return a / damping, b / damping
 
 
 # Equations are DreamCatalyst's, numbered by the labels of its LaTeX source.
@@ -174,13 +181,16 @@ for _row in _TABLE:
 
 
 def get_rule(name: str, preset: str = "paper", **overrides: float) -> Rule:
-    """The rule `name` with the parameters of `preset`, single ones replaced by `overrides` (chi, delta, gamma, gap).
+    """The rule `name` with the parameters of `preset`, single ones replaced by `overrides` (chi, delta, gamma, gap,
+    implicit_step).
 
-    Raises ConfigError for an unknown rule, preset or parameter, naming the nearest.
+    Raises ConfigError for an unknown rule, preset or parameter, naming the nearest, and for a negative step.
     """
     rule: Rule = RULES.get(name, "system.guidance.rule")
     parameters = PRESETS[choose("preset of rule parameters", preset, PRESETS, "system.guidance.preset")]
     known = [f.name for f in fields(Parameters)]
     for key in overrides:
         choose("rule parameter", key, known, "system.guidance")
+    if not 0 <= overrides.get("implicit_step", 0.0) < math.inf:
+        raise ConfigError(f"system.guidance.implicit_step: got {overrides['implicit_step']}, expected 0 or more.")
     return replace(rule, parameters=replace(parameters, **overrides))

@@ -30,12 +30,3 @@ def noised(clean: Tensor, noise: Tensor, abar: Tensor) -> tuple[Tensor, Tensor]:
     """x_t and v of clean latents [B,C,h,w] at abar [B] (Salimans & Ho 2022: v = sqrt(abar) eps - sqrt(1-abar) x_0)."""
     signal, sigma = abar.sqrt()[:, None, None, None], (1 - abar).sqrt()[:, None, None, None]
     return signal * clean + sigma * noise, signal * noise - sigma * clean
-
-
-def min_snr_weights(abar: Tensor, gamma: float) -> Tensor:
-    """Weights [B] of the error in v: min(SNR, gamma) / (SNR + 1), which is min(SNR, gamma) on the clean latent.
-
-    Source: Hang et al. 2023, "Efficient diffusion training via min-SNR weighting strategy".
-    """
-    snr = abar / (1 - abar)
-    return torch.clamp(snr, max=gamma) / (snr + 1)

@@ -87,7 +87,6 @@ class UnetConfig(Stage):
     layers: int = 1
     groups: int = 8
     heads: int = 4
-    min_snr: float = 5.0  # Hang et al. 2023
     drop_text: float = 0.05  # Brooks et al. 2023, as the next two
     drop_image: float = 0.05
     drop_both: float = 0.05

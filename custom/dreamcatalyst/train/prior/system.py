@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from .data import PriorData
 from .folder import write_prior
 from .judge import SamplesConfig, edit_rows, judge_pairs, reconstruction_rows, score_table, sheet
 from .latents import cached_latents
-from .losses import min_snr_weights, noised, reconstruction_loss
+from .losses import noised, reconstruction_loss
 from .models import TIMESTEPS, AutoencoderConfig, Stage, TextConfig, UnetConfig, make_networks
 from .vocabulary import learn_merges, vocabulary, write_tokenizer
 
@@ -84,6 +85,7 @@ class PriorSystem(plugin.BaseSystem):
         self.networks: nn.ModuleDict | None = None
         self.latents: dict[str, Tensor] | None = None
         self._loss: float | None = None  # smoothed
+        self._workers: ThreadPoolExecutor | None = None
         self._outcomes: list[dict[str, Any]] = []
 
     def setup(self, stage: str) -> None:
@@ -139,13 +141,11 @@ class PriorSystem(plugin.BaseSystem):
         rate = config.learning_rate * min(1.0, (number + 1) / max(config.warm_up, 1)) * _cosine(done)
         for group in optimizer.param_groups:
             group["lr"] = rate
-        loss = self._autoencoder_loss(number, done) if stage == "autoencoder" else self._unet_loss(number)
-        value = float(loss.detach())
+        optimizer.zero_grad()
+        value = self._autoencoder_gradients(number, done) if stage == "autoencoder" else self._unet_gradients(number)
         if not math.isfinite(value):
             raise NumericalError(f"step {step}, stage {stage}: the loss is {value}. Lower its learning_rate.")
-        optimizer.zero_grad()
-        self.manual_backward(loss)
-        parameters = [p for name in STAGES[stage] for p in self.networks[name].parameters()]
+        parameters = self.trained(stage)
         nn.utils.clip_grad_norm_(parameters, CLIP)
         optimizer.step()
         kept = [p for name in STAGES[stage] for p in self.ema[name].parameters()]
@@ -155,7 +155,12 @@ class PriorSystem(plugin.BaseSystem):
         self._loss = value if self._loss is None else 0.98 * self._loss + 0.02 * value
         progress.seconds += time.perf_counter() - started
 
-    def _autoencoder_loss(self, number: int, done: float) -> Tensor:
+    def trained(self, stage: str) -> list[nn.Parameter]:
+        """What trains in a stage."""
+        return [p for name in STAGES[stage] for p in self.networks[name].parameters()]
+
+    def _autoencoder_gradients(self, number: int, done: float) -> float:
+        """The loss of one step, its gradients left in the parameters."""
         config: AutoencoderConfig = self.part["autoencoder"]
         side, size = config.crop, config.batch_size
         if done >= 1 - config.whole:
@@ -165,21 +170,49 @@ class PriorSystem(plugin.BaseSystem):
         noise = torch.randn(posterior.mean.shape, generator=keyed_generator(self.cfg.seed, "posterior", number))
         made = self.networks["vae"].decode(posterior.mean + posterior.std * noise.to(images)).sample
         divergence = 0.5 * (posterior.mean**2 + posterior.var - 1 - posterior.logvar).mean()
-        return reconstruction_loss(made, images, config.gradients) + config.kl * divergence
+        loss = reconstruction_loss(made, images, config.gradients) + config.kl * divergence
+        self.manual_backward(loss)
+        return float(loss.detach())
 
-    def _unet_loss(self, number: int) -> Tensor:
-        config: UnetConfig = self.part["unet"]
-        index = self.data.batch(number, config.batch_size)
-        clean, image, texts, noise, t = self._unet_inputs(index, number)
-        abar = self.abar.to(self.device)[t]
-        noisy, v = noised(clean, noise, abar)
+    def _unet_gradients(self, number: int) -> float:
+        """The loss of one step, its gradients left in the parameters.
+
+        On a CPU every thread takes its own rows of the batch all the way: threads that wait for each other once a step,
+        and not within every operation, keep their speed where cores are shared.
+        """
+        size = self.part["unet"].batch_size
+        drawn = self._unet_inputs(self.data.batch(number, size), number)
+        threads = min(torch.get_num_threads(), size) if self.device.type == "cpu" else 1
+        if threads == 1:
+            loss = self._unet_loss(drawn, slice(0, size))
+            self.manual_backward(loss)
+            return float(loss.detach())
+        parameters, ends = self.trained("unet"), [size * i // threads for i in range(threads + 1)]
+
+        def part(rows: slice) -> tuple[Tensor, Sequence[Tensor | None]]:
+            with torch.enable_grad():
+                loss = self._unet_loss(drawn, rows)
+                return loss.detach(), torch.autograd.grad(loss, parameters, allow_unused=True)
+
+        if self._workers is None:
+            self._workers = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+        losses, gradients = zip(*self._workers.map(part, map(slice, ends, ends[1:])), strict=True)
+        for parameter, *parts in zip(parameters, *gradients, strict=True):
+            parameter.grad = None if parts[0] is None else sum(parts)
+        return float(sum(losses))
+
+    def _unet_loss(self, drawn: Sequence[Tensor], rows: slice) -> Tensor:
+        """What `rows` of a batch add to the mean squared error in v (Salimans & Ho 2022), unweighted: what an
+        instruction asks for is decided at high noise, where other weights are small."""
+        clean, image, ids, noise, t = (tensor[rows] for tensor in drawn)
+        noisy, v = noised(clean, noise, self.abar.to(self.device)[t])
         inputs = torch.cat([noisy, image], 1).to(memory_format=torch.channels_last)
-        predicted = self.networks["unet"](inputs, t, encoder_hidden_states=self._embed(texts), return_dict=False)[0]
-        error = F.mse_loss(predicted.float(), v, reduction="none").mean((1, 2, 3))
-        return (min_snr_weights(abar, config.min_snr) * error).mean()
+        text = self.networks["text_encoder"](ids)[0]
+        predicted = self.networks["unet"](inputs, t, encoder_hidden_states=text, return_dict=False)[0]
+        return F.mse_loss(predicted.float(), v, reduction="sum") / drawn[0].numel()
 
-    def _unet_inputs(self, index: np.ndarray, number: int) -> tuple[Tensor, Tensor, list[str], Tensor, Tensor]:
-        """Clean scaled latents, image latents, instructions, noise and timesteps of one step.
+    def _unet_inputs(self, index: np.ndarray, number: int) -> tuple[Tensor, ...]:
+        """Clean scaled latents, image latents, token numbers [B,L], noise and timesteps of one step.
 
         Conditions are dropped as in Brooks et al. 2023, but for one thing: without an instruction and with the image,
         the aim is the image itself. The null instruction then changes nothing, and guidance points from there.
@@ -196,17 +229,10 @@ class PriorSystem(plugin.BaseSystem):
         clean = torch.where(_column(no_text), source, edited)
         image = source * _column(~(no_image | neither))
         given = self.data.pairs.instruction[index]
-        texts = ["" if gone else str(text) for text, gone in zip(given, no_text | neither, strict=True)]
+        ids = [self._ids("" if gone else str(text)) for text, gone in zip(given, no_text | neither, strict=True)]
         noise = torch.randn(clean.shape, generator=keyed_generator(self.cfg.seed, "noise", number))
-        clean, image, noise, t = (x.to(self.device) for x in (clean, image, noise, t))
-        return clean / self.latent_std, image, texts, noise, t
-
-    def _embed(self, texts: Sequence[str]) -> Tensor:
-        """Text embeddings [B,L,D] with a graph; an instruction that comes more than once is encoded once."""
-        distinct = list(dict.fromkeys(texts))
-        ids = torch.stack([self._ids(text) for text in distinct]).to(self.device)
-        places = torch.tensor([distinct.index(text) for text in texts], device=self.device)
-        return self.networks["text_encoder"](ids)[0][places]
+        drawn = (clean / self.latent_std.to(clean), image, torch.stack(ids), noise, t)
+        return tuple(tensor.to(self.device) for tensor in drawn)
 
     def _ids(self, text: str) -> Tensor:
         """Token numbers [L] of one instruction, by the tokenizer that is written with the model."""
