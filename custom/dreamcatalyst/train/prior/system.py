@@ -203,7 +203,7 @@ class PriorSystem(plugin.BaseSystem):
 
     def _unet_loss(self, drawn: Sequence[Tensor], rows: slice) -> Tensor:
         """What `rows` of a batch add to the mean squared error in v (Salimans & Ho 2022), unweighted: what an
-        instruction asks for is decided at high noise, where other weights are small."""
+        instruction asks for is decided at high noise, where weights by the signal-to-noise ratio all but vanish."""
         clean, image, ids, noise, t = (tensor[rows] for tensor in drawn)
         noisy, v = noised(clean, noise, self.abar.to(self.device)[t])
         inputs = torch.cat([noisy, image], 1).to(memory_format=torch.channels_last)
@@ -216,10 +216,12 @@ class PriorSystem(plugin.BaseSystem):
 
         Conditions are dropped as in Brooks et al. 2023, but for one thing: without an instruction and with the image,
         the aim is the image itself. The null instruction then changes nothing, and guidance points from there.
+        Timesteps are drawn in proportion to themselves: the noisier, the more of an edit is still to be found.
         """
         config: UnetConfig = self.part["unet"]
         rng = np.random.default_rng((self.cfg.seed, number, 1))
-        draw, t = rng.random(len(index)), torch.from_numpy(rng.integers(0, TIMESTEPS, len(index)))
+        draw, noisiness = rng.random(len(index)), rng.random(len(index)) ** 0.5
+        t = torch.from_numpy((TIMESTEPS * noisiness).astype(np.int64))
         text_end, image_end = config.drop_text, config.drop_text + config.drop_image
         no_text = draw < text_end
         no_image = (text_end <= draw) & (draw < image_end)
