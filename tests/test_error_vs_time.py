@@ -159,6 +159,11 @@ def test_lengths_scale_with_all_that_counts_steps():
     assert not any("densify.stop" in text for text in cell.overrides)
 
 
+def test_a_rate_that_is_a_schedule_goes_over_the_run_that_it_is_in():
+    assert cells.scaled(0.01, 3.0, 50) == "0.03"
+    assert cells.scaled([0, 0.05, 0.005, 400], 3.0, 50) == "[0,0.15,0.015,50]"
+
+
 def test_seeds_reach_views_and_noise():
     order = Results().run_all(cells.Settings((bench(),), seeds=(3,), trials=0))
     assert {(value(cell, "seed"), value(cell, "data.seed")) for cell in order} == {("3", "3")}
@@ -338,7 +343,7 @@ def test_every_edit_is_possible_in_its_world_and_methods_are_tuned_on_others():
 def test_on_one_prior_every_rule_rests_at_the_edit():
     def config(family: str) -> GuidanceConfig:
         given = dict(setting.split("=") for setting in cells.FAMILIES[family].settings)
-        return GuidanceConfig(**given, max_step_percent=0.5)
+        return parse(GuidanceConfig, {**given, "max_step_percent": 0.5}, "system.guidance")
 
     prior = balance.common_prior(config("dreamcatalyst"))
     assert balance.balanced_scale(prior, config("dreamcatalyst")) == pytest.approx(7.5)

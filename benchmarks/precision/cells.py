@@ -158,6 +158,13 @@ def number(value: float) -> str:
     return f"{value:.6g}"
 
 
+def scaled(rate: float | Sequence[float], factor: float, steps: int) -> str:
+    """A learning rate times `factor`; a schedule [first step, from, to, last step] goes over a run of `steps`."""
+    if isinstance(rate, Sequence):
+        return f"[{rate[0]},{number(rate[1] * factor)},{number(rate[2] * factor)},{steps}]"
+    return number(rate * factor)
+
+
 def adjusted(bench: Bench, family: str, mode: str, length: float, point: Point) -> tuple[str, ...]:
     """The overrides of a family at one point of the search, for `length` times the mode's steps."""
     system, chosen = bench.values["system"], FAMILIES[family]
@@ -171,7 +178,7 @@ def adjusted(bench: Bench, family: str, mode: str, length: float, point: Point) 
     out += [f"system.mode={mode}", f"trainer.max_steps={steps}", f"system.report.every={max(steps // ROWS, 1)}"]
     rates = system["learning_rates"]
     if point[0]:
-        out += [f"system.learning_rates.{key}={number(rates[key] * RATE ** point[0])}" for key in RATES if key in rates]
+        out += [f"system.learning_rates.{key}={scaled(rates[key], RATE ** point[0], steps)}" for key in RATES if key in rates]
     if rates.get("warm_up_steps"):
         out.append(f"system.learning_rates.warm_up_steps={round(rates['warm_up_steps'] * bench.length)}")
     every = {key: system["densify"].get(key, 0) for key in ("every", "start", "stop")}

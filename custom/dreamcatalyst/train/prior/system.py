@@ -281,8 +281,7 @@ class PriorSystem(plugin.BaseSystem):
 
     def on_train_end(self) -> None:
         self.write_folder()
-        if self.progress["unet"].at(self.true_global_step, self.part["unet"]) < 1:
-            self.save_now()  # ended by something else, such as trainer.max_time
+        self.save_now()  # ended by minutes or trainer.max_time, it is at no step that the checkpoints' interval hits
 
     # --- looking
 
