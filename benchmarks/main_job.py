@@ -31,6 +31,10 @@ CEILING = [  # each view's edit is sampled from (nearly) pure noise at its first
     "system.guidance.per_editing_step=0",
     "system.guidance.edit_min_percent=0.99",
     "system.guidance.edit_max_percent=0.99",
+    "system.guidance.guidance_scale=2",  # at which its samples are best (benchmarks/prior.py)
+    "system.guidance.prior.freeu.mode=none",
+    "system.guidance.reduction=mean",  # of an L1 of pictures, of weight 10 in GaussianEditor
+    "system.loss.lambda_guidance=10",
 ]
 RUNS = {"high-quality": [], "fast": ["system.mode=fast"], "ceiling": CEILING}
 COLUMNS = ("unedited", "high-quality", "fast", "ceiling")

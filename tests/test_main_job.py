@@ -1,0 +1,89 @@
+"""The main job on the shipped model, and its twin on InstructPix2Pix: one program, two sets of values."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from dreamcatalyst.demo.edits import EDITS, NOTHING
+from dreamcatalyst.diffusion.folder import SHIPPED, SHIPPED_NAME
+from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig
+
+import launch
+
+ROOT = Path(launch.__file__).parent
+DIFFERENT = {  # the keys in which the two configs differ: what the model is, its size, and what was measured on it
+    "name",
+    "data.source",
+    "data.width",
+    "data.height",
+    "system.gs_source",
+    "system.prompt_processor.prompt",
+    "system.guidance.guidance_scale",
+    "system.guidance.max_step_percent",
+    "system.guidance.prior.freeu.b1",
+    "system.guidance.prior.freeu.b2",
+    "system.guidance.prior.path",
+    "system.guidance.prior.dtype",
+    "system.learning_rates.sh0",
+    "system.learning_rates.warm_up_steps",
+    "system.mask.threshold",
+    "system.report.every",
+    "system.steps.fast",
+    "system.steps.high-quality",
+}
+
+
+def flat(values: dict, prefix: str = "") -> dict[str, object]:
+    out = {}
+    for key, value in values.items():
+        out |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return out
+
+
+def test_the_two_configs_differ_in_the_listed_values_only():
+    small, large = (
+        flat(yaml.safe_load((ROOT / "configs" / name).read_text(encoding="utf-8")))
+        for name in ("dc-ge.yaml", "dc-ge-ip2p.yaml")
+    )
+    assert list(small) == list(large)
+    assert {key for key in small if small[key] != large[key]} == DIFFERENT
+
+
+def test_the_shipped_model_is_small_and_says_what_it_is():
+    weights = sum(file.stat().st_size for file in SHIPPED.rglob("*.safetensors"))
+    assert 1e6 < weights <= 24e6
+    assert all((SHIPPED / name).stat().st_size > 200 for name in ("README.md", "LICENSE", "model_index.json"))
+    taught = json.loads((SHIPPED / "instructions.json").read_text(encoding="utf-8"))
+    assert set(taught) <= set(EDITS) and {"panda", "polar bear", "sunset", "night", NOTHING} <= set(taught)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return InstructPix2Pix(Ip2pConfig(path=SHIPPED_NAME))
+
+
+def test_it_loads_as_a_pipeline_of_diffusers():
+    from diffusers import StableDiffusionInstructPix2PixPipeline
+    from PIL import Image
+
+    pipe = StableDiffusionInstructPix2PixPipeline.from_pretrained(SHIPPED, local_files_only=True)
+    pipe.set_progress_bar_config(disable=True)
+    image = Image.new("RGB", (128, 128), (90, 120, 160))
+    made = pipe("Make it night", image=image, num_inference_steps=2, output_type="pt").images
+    assert made.shape == (1, 3, 128, 128) and bool(torch.isfinite(made).all())
+
+
+def test_its_autoencoder_keeps_pictures(prior):
+    from dreamcatalyst.demo.worlds import make_world
+    from dreamcatalyst.render.api import rasterize
+    from dreamcatalyst.report.metrics import psnr
+
+    world = make_world("statue")
+    with torch.no_grad():
+        image = rasterize(world.scene, world.cameras[:1]).rgb.clamp(0, 1).permute(0, 3, 1, 2)
+        again = prior.decode(prior.encode(image))
+    assert float(psnr(again.permute(0, 2, 3, 1), image.permute(0, 2, 3, 1))) > 28
