@@ -23,7 +23,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "custom"))
 
-from dreamcatalyst.demo.edits import possible  # noqa: E402
+from dreamcatalyst.demo.edits import find_edit, possible  # noqa: E402
 from dreamcatalyst.demo.worlds import make_world  # noqa: E402
 
 CEILING = [  # each view's edit is sampled from (nearly) pure noise at its first visit, and never again
@@ -44,6 +44,8 @@ def launch(folder: Path, name: str, instruction: str, source: str, more: list[st
     """One run; PSNR inside (of everything, for global edits) and outside, the unedited one, and seconds in all."""
     given = [f"data.source={source}", f"system.prompt_processor.prompt={instruction}", f"exp_root_dir={folder}"]
     given += ["name=run", f"tag={name}", "use_timestamp=false", "system.report.video_frames=0", *more]
+    if find_edit(instruction).scope == "global":
+        given += ["system.mask.kind=none"]
     command = [sys.executable, str(ROOT / "launch.py"), "--config", str(ROOT / "configs/dc-ge.yaml"), *given]
     started = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)

@@ -28,6 +28,7 @@ DIFFERENT = {  # the keys in which the two configs differ: what the model is, it
     "system.guidance.prior.freeu.b2",
     "system.guidance.prior.path",
     "system.guidance.prior.dtype",
+    "system.learning_rates.opacities",
     "system.learning_rates.sh0",
     "system.learning_rates.warm_up_steps",
     "system.mask.threshold",

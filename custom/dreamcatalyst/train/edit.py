@@ -26,6 +26,7 @@ from ..scene.gaussians import Gaussians
 from ..scene.ply import read_ply, write_ply
 from ..segment.api import MaskConfig
 from .confine import Start, confine
+from .densify import DensifyConfig
 from .finite import require_finite
 from .plan import Draft, describe_edit
 from .preview import PreviewConfig, preview_sheet
@@ -77,6 +78,13 @@ def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> 
     )
 
 
+@dataclass(frozen=True)
+class EditDensifyConfig(DensifyConfig):
+    """Density control of an edit: the source has large splats of its own, a sky for one, which are no mistake."""
+
+    max_size: float = 0.0
+
+
 @plugin.register("dreamcatalyst-edit-system")
 class EditSystem(SplatSystem):
     """Edits the splats of gs_source (or of a made world) as the instruction says."""
@@ -87,6 +95,7 @@ class EditSystem(SplatSystem):
         "prompt_processor": PromptConfig,
         "preview": PreviewConfig,
         "mask": MaskConfig,
+        "densify": EditDensifyConfig,
         "anchor": AnchorConfig,
         "loss": LossConfig,
     }
