@@ -178,7 +178,8 @@ def adjusted(bench: Bench, family: str, mode: str, length: float, point: Point) 
     out += [f"system.mode={mode}", f"trainer.max_steps={steps}", f"system.report.every={max(steps // ROWS, 1)}"]
     rates = system["learning_rates"]
     if point[0]:
-        out += [f"system.learning_rates.{key}={scaled(rates[key], RATE ** point[0], steps)}" for key in RATES if key in rates]
+        factor, known = RATE ** point[0], [key for key in RATES if key in rates]
+        out += [f"system.learning_rates.{key}={scaled(rates[key], factor, steps)}" for key in known]
     if rates.get("warm_up_steps"):
         out.append(f"system.learning_rates.warm_up_steps={round(rates['warm_up_steps'] * bench.length)}")
     every = {key: system["densify"].get(key, 0) for key in ("every", "start", "stop")}

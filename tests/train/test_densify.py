@@ -10,6 +10,7 @@ from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 from dreamcatalyst.scene.generations import Generations
 from dreamcatalyst.train.densify import DensifyConfig, densify, observe, reset_opacity, screen_statistics, select
+from dreamcatalyst.train.edit import EditSystem
 from dreamcatalyst.train.optim import LearningRates
 
 
@@ -75,6 +76,14 @@ def test_faint_and_huge_splats_go():
     report = densify(splats, DensifyConfig(grad_threshold=0.5, max_size=0.1), 10.0, generator())
     assert (report.cloned, report.split, report.pruned) == (0, 0, 2)
     assert len(splats) == 1
+
+
+def test_an_edit_keeps_what_is_huge_in_its_source():
+    """A sky of large splats is no floater: without it a global edit would end with a black sky."""
+    splats = with_gradient(make_splats([0.01, 0.01, 5.0], [0.5, 0.001, 0.5]), [0.0, 1.0, 0.0])
+    config = EditSystem.parts["densify"](grad_threshold=0.5)
+    assert densify(splats, config, 10.0, generator()).pruned == 1
+    assert splats.scene.scales.max().item() == pytest.approx(5.0)
 
 
 def test_the_last_splats_are_not_taken():
