@@ -78,6 +78,9 @@ def main() -> None:
     args = parser.parse_args()
     world = make_world(args.source.removeprefix("demo:"))
     known = [edit.phrases[0] for edit in possible(world) if edit.phrases[0]]
+    for instruction in args.instructions or ():
+        if find_edit(instruction) not in possible(world):
+            parser.error(f"--instructions: {args.source} has no edit '{instruction}', expected wordings of: {known}")
     args.table.parent.mkdir(parents=True, exist_ok=True)
     results = json.loads(args.table.read_text(encoding="utf-8")) if args.table.exists() else {}
     rows = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -88,3 +89,17 @@ def test_its_autoencoder_keeps_pictures(prior):
         image = rasterize(world.scene, world.cameras[:1]).rgb.clamp(0, 1).permute(0, 3, 1, 2)
         again = prior.decode(prior.encode(image))
     assert float(psnr(again.permute(0, 2, 3, 1), image.permute(0, 2, 3, 1))) > 28
+
+
+@pytest.mark.slow
+def test_the_main_job_makes_a_panda_and_nothing_else(tmp_path):
+    """In the fast mode: measured are 4.7 dB of gain and 43 dB outside."""
+    given = ["system.mode=fast", "system.report.video_frames=0", "name=job", "tag=panda", "use_timestamp=false"]
+    config = str(ROOT / "configs/dc-ge.yaml")
+    assert launch.main(["--config", config, f"exp_root_dir={tmp_path}", "trainer.accelerator=cpu", *given]) == 0
+    trial = tmp_path / "job/panda"
+    with (trial / "report/error.csv").open(encoding="utf-8") as file:
+        unedited = float(next(csv.DictReader(file))["psnr_truth_inside"])
+    mean = json.loads((trial / "report/summary.json").read_text(encoding="utf-8"))["mean"]
+    assert mean["psnr_truth_inside"] > unedited + 4 and mean["psnr_source_outside"] > 35
+    assert (trial / "save/last.ply").is_file() and (trial / "report/index.html").is_file()

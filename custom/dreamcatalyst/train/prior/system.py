@@ -111,12 +111,12 @@ class PriorSystem(plugin.BaseSystem):
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         return [
             torch.optim.AdamW(
-                [p for name in names for p in self.networks[name].parameters()],
+                self.trained(stage),
                 lr=self.part[stage].learning_rate,
                 betas=(0.9, 0.99),
                 weight_decay=0.01,
             )
-            for stage, names in STAGES.items()
+            for stage in STAGES
         ]
 
     # --- training
