@@ -36,15 +36,16 @@ from benchmarks.precision.runner import Runner, plain  # noqa: E402
 
 QUICK_STEPS = 16
 STATUE = ("data.source=demo:statue",)
+EVERYTHING = ("system.mask.kind=none",)  # the mask by relevance leaves out what changes least
 DEMO = (
     Case("panda", "Turn the bear statue into a panda", STATUE, ablated=True),
-    Case("autumn", "Make it autumn", STATUE, ablated=True),
+    Case("autumn", "Make it autumn", STATUE + EVERYTHING, ablated=True),
     Case("bronze", "Turn the bear statue into a bronze statue", STATUE),
-    Case("snow", "Make it look like just snowed", STATUE),
+    Case("snow", "Make it look like just snowed", STATUE + EVERYTHING),
 )
 DEMO_TUNING = (  # worlds whose seeds are for judging: the prior has seen none of them
     Case("tune-polar", "Turn the bear statue into a polar bear", ("data.source=demo:random:5",)),
-    Case("tune-sunset", "Make it sunset", ("data.source=demo:random:7",)),
+    Case("tune-sunset", "Make it sunset", ("data.source=demo:random:7", *EVERYTHING)),
 )
 CAPTURE = {"fox-autumn": "Make it autumn", "fox-night": "Make it night"}
 CAPTURE_TUNING = (Case("tune-sunset", "Make it sunset", ("data.source=demo:random:4",)),)

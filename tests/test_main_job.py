@@ -25,8 +25,11 @@ DIFFERENT = {  # the keys in which the two configs differ: what the model is, it
     "system.prompt_processor.prompt",
     "system.guidance.guidance_scale",
     "system.guidance.max_step_percent",
+    "system.guidance.min_step_percent",
     "system.guidance.prior.freeu.b1",
     "system.guidance.prior.freeu.b2",
+    "system.guidance.prior.freeu.s1",
+    "system.guidance.prior.freeu.s2",
     "system.guidance.prior.path",
     "system.guidance.prior.dtype",
     "system.learning_rates.opacities",
@@ -93,7 +96,7 @@ def test_its_autoencoder_keeps_pictures(prior):
 
 @pytest.mark.slow
 def test_the_main_job_makes_a_panda_and_nothing_else(tmp_path):
-    """In the fast mode: measured are 4.7 dB of gain and 43 dB outside."""
+    """In the fast mode: measured are 6.0 dB of gain and 44 dB outside."""
     given = ["system.mode=fast", "system.report.video_frames=0", "name=job", "tag=panda", "use_timestamp=false"]
     config = str(ROOT / "configs/dc-ge.yaml")
     assert launch.main(["--config", config, f"exp_root_dir={tmp_path}", "trainer.accelerator=cpu", *given]) == 0
@@ -101,5 +104,5 @@ def test_the_main_job_makes_a_panda_and_nothing_else(tmp_path):
     with (trial / "report/error.csv").open(encoding="utf-8") as file:
         unedited = float(next(csv.DictReader(file))["psnr_truth_inside"])
     mean = json.loads((trial / "report/summary.json").read_text(encoding="utf-8"))["mean"]
-    assert mean["psnr_truth_inside"] > unedited + 4 and mean["psnr_source_outside"] > 35
+    assert mean["psnr_truth_inside"] > unedited + 5 and mean["psnr_source_outside"] > 35
     assert (trial / "save/last.ply").is_file() and (trial / "report/index.html").is_file()

@@ -79,10 +79,19 @@ METHODS = (
 )
 
 FREEU, ANCHOR, DENSIFY, MASK = f"{GUIDANCE}prior.freeu", "system.anchor.kind", "system.densify.every", "system.mask"
+
+
+def freeu(b: float, s1: float = 1.0, s2: float = 1.0) -> tuple[str, ...]:
+    """FreeU with these factors: b of the backbone, s1 and s2 of the skips' low frequencies."""
+    return (f"{FREEU}.mode=paper", f"{FREEU}.b1={b}", f"{FREEU}.b2={b}", f"{FREEU}.s1={s1}", f"{FREEU}.s2={s2}")
+
+
 ABLATIONS: dict[str, tuple[str, ...]] = {  # of dreamcatalyst; all say what they are, whatever the config's own is
     "FreeU b = 1.0": (f"{FREEU}.mode=none",),
-    "FreeU b = 1.1": (f"{FREEU}.mode=paper", f"{FREEU}.b1=1.1", f"{FREEU}.b2=1.1"),
-    "FreeU b = 1.3": (f"{FREEU}.mode=paper", f"{FREEU}.b1=1.3", f"{FREEU}.b2=1.3"),
+    "FreeU b = 1.1": freeu(1.1),
+    "FreeU b = 1.3": freeu(1.3),
+    "FreeU b = 1.1, skips 0.9, 0.2": freeu(1.1, 0.9, 0.2),  # the paper's factors
+    "FreeU b = 1.3, skips 0.9, 0.2": freeu(1.3, 0.9, 0.2),
     "anchors and densification": (f"{ANCHOR}=last-densify",),
     "proximal anchors and densification": (f"{ANCHOR}=last-densify", "system.anchor.form=proximal"),
     "no anchors, densification": (f"{ANCHOR}=none",),
