@@ -43,6 +43,12 @@ DEMO = (
     Case("bronze", "Turn the bear statue into a bronze statue", STATUE),
     Case("snow", "Make it look like just snowed", STATUE + EVERYTHING),
 )
+# A common start of the search for all rules: noise as published, and rates of the colours for runs of few steps.
+ALIKE = (
+    "system.guidance.noise=independent",
+    "system.guidance.min_step_percent=0.35",
+    'system.learning_rates.sh0=[0,0.15,0.01,"${trainer.max_steps}"]',
+)
 DEMO_TUNING = (  # worlds whose seeds are for judging: the prior has seen none of them
     Case("tune-polar", "Turn the bear statue into a polar bear", ("data.source=demo:random:5",)),
     Case("tune-sunset", "Make it sunset", ("data.source=demo:random:7", *EVERYTHING)),
@@ -62,7 +68,7 @@ def demo_bench(args: argparse.Namespace) -> Bench | str:
     """The edits of a made world with the small prior; in words, why not."""
     from dreamcatalyst.diffusion.folder import SHIPPED, SHIPPED_NAME
 
-    given = [f"system.guidance.prior.path={Path(args.prior).resolve()}"] if args.prior else []
+    given = [*ALIKE, *([f"system.guidance.prior.path={Path(args.prior).resolve()}"] if args.prior else [])]
     config = str(Path(args.config).resolve())
     values = values_of(config, given)
     guidance = values["system"]["guidance"]

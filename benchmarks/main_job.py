@@ -35,6 +35,7 @@ CEILING = [  # each view's edit is sampled from (nearly) pure noise at its first
     "system.guidance.prior.freeu.mode=none",
     "system.guidance.reduction=mean",  # of an L1 of pictures, of weight 10 in GaussianEditor
     "system.loss.lambda_guidance=10",
+    "system.learning_rates.sh0=[0,0.15,0.01,200]",
 ]
 RUNS = {"high-quality": [], "fast": ["system.mode=fast"], "ceiling": CEILING}
 COLUMNS = ("unedited", "high-quality", "fast", "ceiling")

@@ -26,6 +26,7 @@ DIFFERENT = {  # the keys in which the two configs differ: what the model is, it
     "system.guidance.guidance_scale",
     "system.guidance.max_step_percent",
     "system.guidance.min_step_percent",
+    "system.guidance.noise",
     "system.guidance.prior.freeu.b1",
     "system.guidance.prior.freeu.b2",
     "system.guidance.prior.freeu.s1",

@@ -92,6 +92,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {  # of dreamcatalyst; all say what they
     "FreeU b = 1.3": freeu(1.3),
     "FreeU b = 1.1, skips 0.9, 0.2": freeu(1.1, 0.9, 0.2),  # the paper's factors
     "FreeU b = 1.3, skips 0.9, 0.2": freeu(1.3, 0.9, 0.2),
+    "alternating noise": (f"{GUIDANCE}noise=alternating",),
     "anchors and densification": (f"{ANCHOR}=last-densify",),
     "proximal anchors and densification": (f"{ANCHOR}=last-densify", "system.anchor.form=proximal"),
     "no anchors, densification": (f"{ANCHOR}=none",),

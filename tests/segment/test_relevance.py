@@ -58,6 +58,22 @@ def test_rounding_errors_of_an_untouched_background_are_no_mask():
     assert float((found > 0.5).sum()) == 100
 
 
+def plane(background: float) -> dict[int, torch.Tensor]:
+    """Relevance of 1 on a fifth of two views, of `background` elsewhere."""
+    values = torch.full((20, 20), background)
+    values[:4] = 1.0
+    return {0: values, 5: values.flip(0)}
+
+
+def test_an_edit_of_everything_is_told_from_one_of_a_thing():
+    """What changes least is a share of what changes most, or next to nothing."""
+    assert Relevance().concerns_all(plane(0.2)) and not Relevance().concerns_all(plane(0.04))
+    assert not Relevance(everywhere=1).concerns_all(plane(0.9))
+    assert not Relevance(noise="independent").concerns_all(plane(0.2))
+    faint = {view: 0.05 * values for view, values in plane(0.2).items()}  # a thing that is small, or hardly changes
+    assert not Relevance().concerns_all(faint)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.3])
 def test_no_difference_is_an_error(value):
     with pytest.raises(PriorError, match="everywhere the same with the instruction as without"):
@@ -90,7 +106,15 @@ def test_without_a_prior_there_is_none(disc_world):
 
 
 @pytest.mark.parametrize(
-    "options", [{"lowest": 0.9, "highest": 0.5}, {"draws": 0}, {"noise": "pink"}, {"threshold": 1.0}, {"blur": -1.0}]
+    "options",
+    [
+        {"lowest": 0.9, "highest": 0.5},
+        {"draws": 0},
+        {"noise": "pink"},
+        {"threshold": 1.0},
+        {"blur": -1.0},
+        {"everywhere": 0.0},
+    ],
 )
 def test_options_that_cannot_be(options):
     with pytest.raises(ConfigError):

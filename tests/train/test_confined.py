@@ -115,6 +115,20 @@ def test_edit_after_edit_with_the_first_scene_as_source(launch, statue):
     assert len(after) == len(before)
 
 
+@pytest.mark.parametrize("mask", ["{kind: box, options: {center: [0, 0, 0], radius: 1000}}", "{kind: relevance}"])
+def test_a_mask_that_leaves_nothing_out_is_none(launch, mask):
+    """Night changes every pixel, so that relevance leaves nothing out either. The PLY still says so."""
+    options = ["trainer.max_steps=4", "system.prompt_processor.prompt=Make it night", *GROWING, *ANCHORED]
+    free, masked = (
+        launch("closed-form.yaml", *options, *given, name=name)
+        for given, name in (([], "free"), ([f"system.mask={mask}"], "masked"))
+    )
+    assert_same_splats(free, masked)
+    assert bool((read_ply(masked / "save" / "last.ply").extra["mask"] == 1).all())
+    plan = json.loads((masked / "report" / "plan.json").read_text())
+    assert "frozen splats" in {part["name"] for part in plan["leaves_out"]}
+
+
 def test_kept_masks_need_splats_that_carry_one(launch, tmp_path, statue, capsys):
     bare = write_ply(tmp_path / "bare.ply", statue[::10])
     launch("closed-form.yaml", f"system.gs_source={bare}", "system.mask.kind=kept", status=2)

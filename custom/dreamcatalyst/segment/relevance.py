@@ -23,6 +23,7 @@ from ..guidance.guidance import Guidance
 from .api import MaskRequest, Segmenter
 from .cache import stamp
 
+UNMOVED = 0.02  # mean difference of predicted noise, in its standard deviations, below which a pixel is left alone
 FENCE = 1.5  # interquartile ranges beyond the quartiles, from where on values are outliers (Tukey 1977)
 
 
@@ -39,6 +40,7 @@ class Relevance(Segmenter):
     threshold: float = 0.5  # of the normalised relevance, in (0,1)
     softness: float = 0.2  # width of the ramp of the mask around the threshold; 0: a step
     blur: float = 0.01  # standard deviation of a Gaussian blur before it, fraction of the view's longer side
+    everywhere: float = 0.05  # an edit of all where the least tenth has this share of the 99th percentile; 1: never
     seed: int = 0  # of the noise
 
     def __post_init__(self) -> None:
@@ -52,11 +54,23 @@ class Relevance(Segmenter):
                 raise ConfigError(f"{name}: got {getattr(self, name)}, expected 1 or more.")
         if not 0 < self.threshold < 1 or self.softness < 0 or self.blur < 0:
             raise ConfigError("threshold must lie between 0 and 1, softness and blur must not be negative.")
+        if not 0 < self.everywhere <= 1:
+            raise ConfigError(f"everywhere: got {self.everywhere}, expected more than 0 and at most 1 (1: never).")
 
     def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor]:
         guidance = _guidance(request)
-        maps = normalised({view: self.difference(guidance, request.render(view), view) for view in views})
-        return {view: self.mask(values, request.cameras[view]) for view, values in maps.items()}
+        maps = {view: self.difference(guidance, request.render(view), view) for view in views}
+        if self.concerns_all(maps):
+            return {view: torch.ones(request.cameras[view].height, request.cameras[view].width) for view in views}
+        return {view: self.mask(values, request.cameras[view]) for view, values in normalised(maps).items()}
+
+    def concerns_all(self, maps: dict[int, Tensor]) -> bool:
+        """Whether the instruction changes everything, so that a mask would only leave out what changes least: night
+        falls on what is dark already, too. Unpaired noise is everywhere, and says nothing. maps: of `difference`."""
+        if self.noise != "paired":
+            return False
+        least, high = np.quantile(pooled(maps), [0.1, 0.99])
+        return bool(least > max(self.everywhere * high, UNMOVED))
 
     def identity(self, request: MaskRequest) -> Any:
         prior = _guidance(request).prior
@@ -100,6 +114,11 @@ def _guidance(request: MaskRequest) -> Guidance:
     return request.guidance
 
 
+def pooled(maps: dict[int, Tensor]) -> np.ndarray:
+    """The values of all views. For numpy's quantiles, which take any number of values; torch.quantile only 2^24."""
+    return np.concatenate([m.cpu().numpy().ravel() for m in maps.values()])
+
+
 def normalised(maps: dict[int, Tensor]) -> dict[int, Tensor]:
     """Relevance of all views together to [0,1]: what lies more than 1.5 interquartile ranges beyond the quartiles is
     clipped, and the rest stretched from its least to its greatest.
@@ -108,8 +127,7 @@ def normalised(maps: dict[int, Tensor]) -> dict[int, Tensor]:
     quartiles lie in rounding errors, and clipping at them would make a mask of those.
     Raises PriorError where the prior does not tell the instruction from none.
     """
-    # numpy's quantiles take any number of values, torch.quantile only 2^24
-    values = np.concatenate([m.cpu().numpy().ravel() for m in maps.values()])
+    values = pooled(maps)
     first, third, high = np.quantile(values, [0.25, 0.75, 0.99])
     least = max(float(values.min()), float(first - FENCE * (third - first)))
     most = min(float(values.max()), max(float(third + FENCE * (third - first)), float(high) / 2))

@@ -45,17 +45,20 @@ class Start:
 PICTURES = 4  # views that show the mask
 
 
-def confine(system: EditSystem, scene: Gaussians) -> tuple[Gaussians, dict[str, Tensor], Tensor]:
+def confine(system: EditSystem, scene: Gaussians) -> tuple[Gaussians, dict[str, Tensor], Tensor | None]:
     """Find the mask of `scene`. Returns the scene with the soft weights [N] as its extra "mask", the state of the
-    editable splats, and which ones these are, bool [N]. Writes pictures of the mask beside the run's results."""
+    editable splats, and which ones these are, bool [N]; None where all are, and the edit goes on as without a mask.
+    Writes pictures of the mask beside the run's results."""
     request = mask_request(system, scene)
     folder = Path(system.get_save_dir()).parent.parent / "masks"  # of all runs of this name
     found = make_mask(system.part["mask"], request, folder)
     count = int(found.mask.sum())
-    plugin.info(f"mask: {count} of {len(scene)} splats may change")
+    whole = count == len(scene)
+    plugin.info(f"mask: {count} of {len(scene)} splats may change{', as without a mask' if whole else ''}")
     write_mask_pictures(system, found, request)
     state = {} if bool((found.update[found.mask] == 1).all()) else {UPDATE: found.update[found.mask]}
-    return scene.with_extra(**{EXTRA: weights_to_keep(found, system.part["mask"].threshold)}), state, found.mask
+    kept = scene.with_extra(**{EXTRA: weights_to_keep(found, system.part["mask"].threshold)})
+    return kept, state, None if whole else found.mask
 
 
 def weights_to_keep(found: Mask, threshold: float) -> Tensor:

@@ -166,7 +166,8 @@ class EditSystem(SplatSystem):
         state, editable = {}, None
         if self.part["mask"].kind != "none" and not self.resumed:  # a checkpoint knows what is editable
             scene, state, editable = confine(self, scene)
-            self.begin_at(scene, editable)
+            if editable is not None:
+                self.begin_at(scene, editable)
         splats = Splats(scene, state, editable)
         if self.generations is not None:
             self.generations.begin(splats)

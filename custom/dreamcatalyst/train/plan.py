@@ -127,7 +127,7 @@ class Draft:
         note = f"{len(splats):,} of {splats.total:,} with parameters, gradients and Adam's two moments"
         self.add("editable splats", note, 4 * own + state + statistics)
         if splats.frozen is None:
-            self.leave_out("frozen splats", "no mask: all splats are editable")
+            self.leave_out("frozen splats", "all splats are editable")
             return
         self.add("frozen splats", "never change: no gradient, no moment, no anchor", scene_bytes(splats.frozen))
         views = len(self.system.capture.views)
