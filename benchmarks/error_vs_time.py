@@ -36,14 +36,14 @@ from benchmarks.precision.runner import Runner, plain  # noqa: E402
 
 QUICK_STEPS = 16
 STATUE = ("data.source=demo:statue",)
-EVERYTHING = ("system.mask.kind=none",)  # the mask by relevance leaves out what changes least
+EVERYTHING = ("system.mask.kind=none",)  # which the mask by relevance would find out
 DEMO = (
     Case("panda", "Turn the bear statue into a panda", STATUE, ablated=True),
     Case("autumn", "Make it autumn", STATUE + EVERYTHING, ablated=True),
     Case("bronze", "Turn the bear statue into a bronze statue", STATUE),
     Case("snow", "Make it look like just snowed", STATUE + EVERYTHING),
 )
-# A common start of the search for all rules: noise as published, and rates of the colours for runs of few steps.
+# What all rules begin with: noise as published, levels that suit all, rates of the colours for runs of few steps.
 ALIKE = (
     "system.guidance.noise=independent",
     "system.guidance.min_step_percent=0.35",

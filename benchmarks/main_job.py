@@ -45,7 +45,7 @@ def launch(folder: Path, name: str, instruction: str, source: str, more: list[st
     """One run; PSNR inside (of everything, for global edits) and outside, the unedited one, and seconds in all."""
     given = [f"data.source={source}", f"system.prompt_processor.prompt={instruction}", f"exp_root_dir={folder}"]
     given += ["name=run", f"tag={name}", "use_timestamp=false", "system.report.video_frames=0", *more]
-    if find_edit(instruction).scope == "global":
+    if find_edit(instruction).scope == "global":  # what the mask would find out
         given += ["system.mask.kind=none"]
     command = [sys.executable, str(ROOT / "launch.py"), "--config", str(ROOT / "configs/dc-ge.yaml"), *given]
     started = time.perf_counter()

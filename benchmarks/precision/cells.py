@@ -27,7 +27,7 @@ class Family:
     neural: tuple[str, ...] = ()
 
 
-# FreeU is DreamCatalyst's; the others are published without. Limits of the noise level are those of their papers.
+# FreeU is DreamCatalyst's; the others are published without. Uniform levels have the limits of their papers.
 PLAIN = "system.guidance.prior.freeu.mode=none"
 UNIFORM = (PLAIN, "system.guidance.min_step_percent=0.02", "system.guidance.max_step_percent=0.98")
 FAMILIES: dict[str, Family] = {

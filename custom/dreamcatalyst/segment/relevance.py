@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .. import plugin
 from ..diffusion.api import Row
 from ..diffusion.noise import abar_at, add_noise, keyed_noise
 from ..errors import ConfigError, PriorError, choose
@@ -40,7 +41,7 @@ class Relevance(Segmenter):
     threshold: float = 0.5  # of the normalised relevance, in (0,1)
     softness: float = 0.2  # width of the ramp of the mask around the threshold; 0: a step
     blur: float = 0.01  # standard deviation of a Gaussian blur before it, fraction of the view's longer side
-    everywhere: float = 0.05  # an edit of all where the least tenth has this share of the 99th percentile; 1: never
+    everywhere: float = 0.08  # an edit of all where the least tenth has this share of the 99th percentile; 1: never
     seed: int = 0  # of the noise
 
     def __post_init__(self) -> None:
@@ -70,7 +71,13 @@ class Relevance(Segmenter):
         if self.noise != "paired":
             return False
         least, high = np.quantile(pooled(maps), [0.1, 0.99])
-        return bool(least > max(self.everywhere * high, UNMOVED))
+        if least <= max(self.everywhere * high, UNMOVED):
+            return False
+        plugin.info(
+            "mask: the instruction changes everything (the least tenth of the relevance is "
+            f"{least / high:.2f} of its 99th percentile); system.mask.options.everywhere=1 masks nevertheless"
+        )
+        return True
 
     def identity(self, request: MaskRequest) -> Any:
         prior = _guidance(request).prior

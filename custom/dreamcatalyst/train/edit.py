@@ -168,6 +168,7 @@ class EditSystem(SplatSystem):
             scene, state, editable = confine(self, scene)
             if editable is not None:
                 self.begin_at(scene, editable)
+            self.guidance.forget_views()  # a mask is sought in clamped renders
         splats = Splats(scene, state, editable)
         if self.generations is not None:
             self.generations.begin(splats)
