@@ -64,12 +64,16 @@ PANELS = {  # of an edit's plot: as many lines as there are colours
     "methods": (FAST, HIGH, "pds", "pds-decreasing", "dds", "in2n"),
     "variants": (HIGH, "dreamcatalyst-psi2", "dreamcatalyst-psi3", "csd-like", "sds", "known-edit"),
     "three times as long": (HIGH, "pds long", "in2n long"),
+    "identity term explicit or implicit": ("pds", "pds-implicit"),
+    "anchors": ("anchors and densification", "proximal anchors and densification", "no anchors, densification"),
 }
-OTHERS = ("pds", "pds-decreasing", "dds", "sds", "csd-like", "in2n", "dreamcatalyst-psi2", "dreamcatalyst-psi3")
+PDS = ("pds", "pds-decreasing", "pds-implicit")
+OTHERS = (*PDS, "dds", "sds", "csd-like", "in2n", "dreamcatalyst-psi2", "dreamcatalyst-psi3")
 
 
 def plot(tracks: Mapping[str, Track | None]) -> str:
-    """Error against seconds of one edit as an SVG: medians, and bands from the lowest to the highest seed."""
+    """Error against seconds of methods and ablations on one edit as an SVG: medians, and bands from the lowest to the
+    highest seed."""
     charts = []
     for name, labels in PANELS.items():
         there = {label: curve for label in labels if (curve := tracks.get(label)) is not None}
@@ -86,17 +90,17 @@ def plot(tracks: Mapping[str, Track | None]) -> str:
 
 def bench_parts(settings: Settings, bench: Bench, entries: Sequence[tuple[Cell, Row]], path: Path) -> list[str]:
     """The sections of one bench; its plots are written beside `path`."""
-    tracks, parts = tracks_of(entries, "methods", bench.name), [f"### {bench.title}"]
+    tracks, ablations = (tracks_of(entries, group, bench.name) for group in ("methods", "ablations"))
+    parts = [f"### {bench.title}"]
     instructions = {case.name: case.instruction for case in bench.cases}
     for case, methods in tracks.items():
         if any(methods.values()):
             file = path.with_name(f"{path.stem}-{bench.name}-{case}.svg")
-            file.write_text(plot(methods), encoding="utf-8")
+            file.write_text(plot({**methods, **ablations.get(case, {})}), encoding="utf-8")
             parts += [f"**{instructions[case]}**", f"![PSNR against seconds]({file.name})", case_table(methods)]
     if any(set(methods) - {HIGH, FAST} for methods in tracks.values()):
         parts += ["**Time to the same error**, in units of DreamCatalyst's:", ratio_table(tracks, OTHERS)]
         parts += ["**The paper's claims:**", claims_table(tracks)]
-    ablations = tracks_of(entries, "ablations", bench.name)
     if ablations:
         parts += ["**Ablations:**", ablation_table(ablations)]
     return parts if len(parts) > 1 else []
