@@ -35,7 +35,7 @@ CEILING = [  # each view's edit is sampled from (nearly) pure noise at its first
     "system.guidance.prior.freeu.mode=none",
     "system.guidance.reduction=mean",  # of an L1 of pictures, of weight 10 in GaussianEditor
     "system.loss.lambda_guidance=10",
-    "system.learning_rates.sh0=[0,0.15,0.01,200]",
+    "system.learning_rates.sh0=[0,0.15,0.01,200]",  # its own, whatever suits the rule
 ]
 RUNS = {"high-quality": [], "fast": ["system.mode=fast"], "ceiling": CEILING}
 COLUMNS = ("unedited", "high-quality", "fast", "ceiling")
@@ -45,7 +45,7 @@ def launch(folder: Path, name: str, instruction: str, source: str, more: list[st
     """One run; PSNR inside (of everything, for global edits) and outside, the unedited one, and seconds in all."""
     given = [f"data.source={source}", f"system.prompt_processor.prompt={instruction}", f"exp_root_dir={folder}"]
     given += ["name=run", f"tag={name}", "use_timestamp=false", "system.report.video_frames=0", *more]
-    if find_edit(instruction).scope == "global":  # what the mask would find out
+    if find_edit(instruction).scope == "global":  # what the mask by relevance would find out
         given += ["system.mask.kind=none"]
     command = [sys.executable, str(ROOT / "launch.py"), "--config", str(ROOT / "configs/dc-ge.yaml"), *given]
     started = time.perf_counter()

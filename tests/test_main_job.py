@@ -9,9 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from dreamcatalyst.config import parse
 from dreamcatalyst.demo.edits import EDITS, NOTHING
+from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.diffusion.folder import SHIPPED, SHIPPED_NAME
 from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig
+from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
+from dreamcatalyst.render.api import rasterize
+from dreamcatalyst.report.metrics import psnr
+from dreamcatalyst.segment.relevance import Relevance
 
 import launch
 
@@ -84,15 +90,31 @@ def test_it_loads_as_a_pipeline_of_diffusers():
 
 
 def test_its_autoencoder_keeps_pictures(prior):
-    from dreamcatalyst.demo.worlds import make_world
-    from dreamcatalyst.render.api import rasterize
-    from dreamcatalyst.report.metrics import psnr
-
     world = make_world("statue")
     with torch.no_grad():
         image = rasterize(world.scene, world.cameras[:1]).rgb.clamp(0, 1).permute(0, 3, 1, 2)
         again = prior.decode(prior.encode(image))
     assert float(psnr(again.permute(0, 2, 3, 1), image.permute(0, 2, 3, 1))) > 28
+
+
+@pytest.mark.parametrize(
+    ("source", "instruction", "all_of_it"),
+    [
+        ("statue", "Make it autumn", True),
+        ("statue", "Make it look like just snowed", True),
+        ("random:3", "Make it night", True),
+        ("statue", "Turn the bear statue into a grizzly bear", False),
+        ("random:3", "Turn the ball white", False),  # small, and its relevance hardly stands out
+    ],
+)
+def test_it_is_told_whether_an_instruction_is_about_everything(source, instruction, all_of_it):
+    values = yaml.safe_load((ROOT / "configs/dc-ge.yaml").read_text(encoding="utf-8"))["system"]["guidance"]
+    guidance = Guidance(parse(GuidanceConfig, values | {"seed": 0}, "system.guidance"), instruction)
+    world, maps = make_world(source), {}
+    for view in (0, 20):
+        image = rasterize(world.scene, world.cameras[view : view + 1]).rgb[0].clamp(0, 1)
+        maps[view] = Relevance().difference(guidance, image, view)
+    assert Relevance().concerns_all(maps) == all_of_it
 
 
 @pytest.mark.slow

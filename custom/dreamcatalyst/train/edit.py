@@ -166,9 +166,10 @@ class EditSystem(SplatSystem):
         state, editable = {}, None
         if self.part["mask"].kind != "none" and not self.resumed:  # a checkpoint knows what is editable
             scene, state, editable = confine(self, scene)
-            if editable is not None:
+            if editable is None:
+                self.guidance.forget_views()  # a mask is sought in clamped renders
+            else:
                 self.begin_at(scene, editable)
-            self.guidance.forget_views()  # a mask is sought in clamped renders
         splats = Splats(scene, state, editable)
         if self.generations is not None:
             self.generations.begin(splats)
