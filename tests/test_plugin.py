@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from dreamcatalyst import OFFERS, plugin
 from dreamcatalyst.config import Scalar
+from dreamcatalyst.demo.worlds import make_world
+from dreamcatalyst.scene.ply import write_ply
 from omegaconf import OmegaConf
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -21,7 +23,7 @@ def python(code: str, folder: Path = ROOT) -> str:
     """What `code` prints in a process of its own, run in `folder`."""
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return done.stdout + done.stderr
 
 
 # --- alone
@@ -105,16 +107,37 @@ load_custom_modules()
 """
 
 
+def new_host(folder: Path) -> Path:
+    """The stand-in host, with nothing in its custom/."""
+    pytest.importorskip("pytorch_lightning", reason="the host runs on pytorch_lightning")
+    shutil.copytree(ROOT / "tests/host", folder, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "custom").mkdir()
+    return folder
+
+
+def link(host: Path) -> None:
+    subprocess.run([sys.executable, "launch.py", "--link", str(host)], cwd=ROOT, check=True)
+
+
+def clone(host: Path, name: str) -> Path:
+    """This repository under `name` in the custom/ of the host."""
+    folder = host / "custom" / name
+    folder.mkdir()
+    for part in ("__init__.py", "extension.yaml", "launch.py"):
+        shutil.copy(ROOT / part, folder)
+    for part in ("custom", "configs"):
+        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
 @pytest.fixture(scope="module")
 def host(tmp_path_factory):
     """The stand-in host with this extension linked by the launcher, and beside it one that cannot be imported."""
-    pytest.importorskip("pytorch_lightning", reason="the host runs on pytorch_lightning")
-    folder = tmp_path_factory.mktemp("host") / "threestudio"
-    shutil.copytree(ROOT / "tests/host", folder, ignore=shutil.ignore_patterns("__pycache__"))
+    folder = new_host(tmp_path_factory.mktemp("host") / "threestudio")
     broken = folder / "custom" / "broken"
-    broken.mkdir(parents=True)
+    broken.mkdir()
     (broken / "__init__.py").write_text("import a_package_that_nobody_has\n")
-    subprocess.run([sys.executable, "launch.py", "--link", str(folder)], cwd=ROOT, check=True)
+    link(folder)
     return folder
 
 
@@ -123,7 +146,7 @@ def test_the_host_finds_every_name_beside_an_extension_that_fails(host):
         f"{CHECK}\n"
         "from dreamcatalyst import OFFERS, plugin\n"
         "import pytorch_lightning as pl\n"
-        "assert plugin.HOSTED and plugin.host_name == 'threestudio' and plugin.pl is pl\n"
+        "assert plugin.HOSTED and plugin.pl is pl\n"
         "for name in OFFERS:\n"
         "    assert threestudio.find(name) is threestudio.__modules__[name] is plugin.find(name), name\n"
         # What the host has not imported itself (cv2 it has) must not be able to make registering fail.
@@ -161,16 +184,79 @@ def test_a_host_that_is_too_old_is_told_so(host):
     assert "dreamcatalyst needs threestudio >= 0.2.1, this is 0.1.9" in told
 
 
+# --- cloned into custom/, instead of linked
+
+NAMES = (
+    "from dreamcatalyst import OFFERS, plugin\n"
+    "for name in OFFERS:\n"
+    "    assert plugin.find(name).__module__ == f'dreamcatalyst{OFFERS[name]}', name\n"
+)
+
+
+@pytest.mark.parametrize("name", ["threestudio-dreamcatalyst", "DreamCatalyst-0.1", "dreamcatalyst"])
+def test_a_clone_in_custom_offers_names_and_configs_whatever_it_is_called(tmp_path, name):
+    folder = clone(new_host(tmp_path / "threestudio"), name)
+    told = python(
+        f"{CHECK}\n{NAMES}\n"
+        "import dreamcatalyst; print(dreamcatalyst.__file__)\n"
+        "from threestudio.utils.config import load_config\n"
+        f"cfg = load_config('custom/{name}/configs/dc-ge.yaml', n_gpus=1)\n"
+        "data, system = plugin.find(cfg.data_type)(cfg.data), plugin.find(cfg.system_type)(cfg.system)\n"
+        "print(type(data).__name__, type(system).__name__)\n",
+        tmp_path / "threestudio",
+    )
+    assert f"custom: {name}\n" in told and str(folder / "custom/dreamcatalyst/__init__.py") in told
+    assert "SplatData EditSystem" in told
+
+
+@pytest.mark.parametrize("first", ["clone", "link"])
+def test_a_clone_and_a_link_register_once_and_the_second_says_which_to_remove(tmp_path, first):
+    """The host imports in any order."""
+    host = new_host(tmp_path / "threestudio")
+    clone(host, "cloned"), link(host)
+    names = ["cloned", "dreamcatalyst"] if first == "clone" else ["dreamcatalyst", "cloned"]
+    listing = f"Path.iterdir = lambda self, names={names}: iter([self / name for name in names])"
+    told = python(
+        f"from pathlib import Path\n{listing}\n{CHECK}\n{NAMES}\n"
+        "import dreamcatalyst, traceback; from dreamcatalyst.guidance import rules\n"
+        "print('used:', Path(dreamcatalyst.__file__).parent, Path(rules.__file__).parent.parent)",
+        host,
+    )
+    homes = {"dreamcatalyst": host / "custom/dreamcatalyst", "cloned": host / "custom/cloned/custom/dreamcatalyst"}
+    used, other = (homes[name] for name in names)
+    assert f"used: {used} {used}" in told
+    assert f"custom: {names[0]}\n" in told and f"custom: {names[1]} (IMPORT FAILED)" in told
+    assert f"dreamcatalyst is in custom/ twice: {used}, which is used, and {other}. Remove one" in told
+
+
+# --- runs in a host
+
+COUNTING = """
+import atexit, sys
+opened = []
+sys.addaudithook(lambda event, values: opened.append(str(values[0])) if event == "open" else None)
+atexit.register(lambda: print("opened", sum(name.endswith("given.ply") for name in opened), "times"))
+"""
+
+
 def in_host(host: Path, *arguments: str) -> subprocess.CompletedProcess:
     command = [sys.executable, "launch.py", "--config", "configs/dreamcatalyst/closed-form.yaml", *arguments]
     return subprocess.run(command, cwd=host, capture_output=True, text=True)
 
 
 def test_the_edit_runs_in_the_host_and_is_validated_and_exported_from_its_checkpoint(host):
+    """The host reads every public attribute of the system before and after each batch, `origin` for one: what it costs
+    may be paid once."""
+    write_ply(host / "given.ply", make_world("statue").scene)
+    counting = host / "custom" / "counting"
+    counting.mkdir()
+    (counting / "__init__.py").write_text(COUNTING)
     short = [f"trainer.max_steps={STEPS}", f"checkpoint.every_n_train_steps={STEPS}", "name=seam", "tag=edit"]
     short += ["data.width=64", "data.height=64", "system.report.every=0", "system.report.video_frames=4"]
+    short += ["data.source=null", "system.gs_source=given.ply"]
     done = in_host(host, "--train", *short)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    assert "opened 2 times" in done.stdout  # where it lies, and then the splats
     (trial,) = (host / "outputs/seam").iterdir()
     assert list(trial.glob("save/**/*.ply")), sorted(trial.rglob("*"))
     (checkpoint,) = trial.glob(f"ckpts/*step={STEPS}.ckpt")
@@ -178,3 +264,18 @@ def test_the_edit_runs_in_the_host_and_is_validated_and_exported_from_its_checkp
         done = in_host(host, mode, *short, f"resume={checkpoint}")
         assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     assert list(trial.glob(f"save/it{STEPS}-*.png")) and list(trial.glob(f"save/it{STEPS}-export/*.ply"))
+
+
+@pytest.mark.parametrize(
+    "wrong, line",
+    [
+        ("data.max_sied=64", "data: unknown key 'max_sied'. Did you mean 'max_side'?"),
+        ("system.gs_sorce=x", "system: unknown key 'gs_sorce'. Did you mean 'gs_source'?"),
+        ("system.guidance.prior.s_imge=1", "system.guidance.prior: unknown key 's_imge'. Did you mean 's_image'?"),
+        ("system.densify.evry=1", "system.densify: unknown key 'evry'. Did you mean 'every'?"),
+    ],
+)
+def test_the_last_line_of_the_host_is_ours_where_a_key_is_wrong(host, wrong, line):
+    done = in_host(host, "--train", wrong, "name=wrong", "tag=t")
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1 and last.startswith("dreamcatalyst.errors.ConfigError: ") and line in last, done.stderr

@@ -63,6 +63,26 @@ def test_dreamfusion_gets_its_loss_from_us(host):
     assert len(done) == 2 and all(loss > 0 for loss in done)
 
 
+@pytest.mark.parametrize(
+    "arguments, line",
+    [
+        (["system.guidance.max_steps=2"], "system.guidance_type: this system asks for edit_images, got loss_sds"),
+        ([], "dreamcatalyst-edit-guidance gives edit_images"),
+        (
+            ["system.guidance.guidence_scale=2"],
+            "system.guidance: unknown key 'guidence_scale'. Did you mean 'guidance_",
+        ),
+    ],
+)
+def test_the_last_line_of_the_host_is_ours_where_another_guidance_is_meant(host, arguments, line):
+    options = ["data.dataroot=none", "system.start_editing_step=-1", "system.guidance_type=dreamcatalyst-guidance"]
+    options += ["system.guidance.prior.path=ip2p", "system.guidance.prior.dtype=fp32"]
+    options += ["system.prompt_processor.pretrained_model_name_or_path=ip2p"]
+    done = run(host, f"{SWAP}/in2n.yaml", *options, *arguments)
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1 and last.startswith("dreamcatalyst.errors.ConfigError: ") and line in last, done.stderr
+
+
 # What the host's own YAMLs have where its own guidance stands.
 GUIDANCE_OF_THE_HOST = {
     "in2n": {"min_step_percent": 0.02, "max_step_percent": 0.98},

@@ -20,12 +20,14 @@ import importlib
 import re
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 HOSTED: bool = "threestudio" in sys.modules
-host_name: str = "threestudio" if HOSTED else "dreamcatalyst"
 OLDEST_HOST = (0, 2, 1)
 
+_home: ModuleType | None = None  # in the host: the package whose offers were taken
 _offers: dict[str, str] = {}  # alone: name -> the module that registers it
 _parts: dict[str, type] = {}  # alone: name -> class
 
@@ -85,8 +87,10 @@ def offer(modules: Mapping[str, str], package: str) -> None:
     """Announce which modules register which names (name -> ".train.fit", relative to `package`).
 
     The host looks into its registry and nowhere else, so there the modules are imported at once (torch and Lightning
-    already are); alone each waits until `find` is asked for its name. Raises ImportError for a host that is too old.
+    already are); alone each waits until `find` is asked for its name. Raises ImportError for a host that is too old,
+    and where custom/ holds this extension twice, as a link and as a clone for instance: the first one stays.
     """
+    global _home
     if not HOSTED:
         _offers.update({name: f"{package}{module}" for name, module in modules.items()})
         return
@@ -94,5 +98,12 @@ def offer(modules: Mapping[str, str], package: str) -> None:
     if tuple(int(n) for n in re.findall(r"\d+", version)[:3]) < OLDEST_HOST:
         oldest = ".".join(map(str, OLDEST_HOST))
         raise ImportError(f"{package} needs threestudio >= {oldest}, this is {version}. Update the host: git pull.")
+    if _home is not None:
+        first, second = (Path(home.__file__).parent for home in (_home, sys.modules[package]))
+        sys.modules[package] = _home  # the host has put the second in its place; what is imported later is the first's
+        raise ImportError(
+            f"{package} is in custom/ twice: {first}, which is used, and {second}. Remove one of them from custom/."
+        )
+    _home = sys.modules[package]
     for module in dict.fromkeys(modules.values()):
         importlib.import_module(module, package)

@@ -51,7 +51,7 @@ class BaseObject:
 class BaseSystem(LightningModule):
     """A LightningModule with a config, a save folder, and update hooks before and after every batch.
 
-    Order: configure, optional weights, post_configure | set_save_dir | Lightning's hooks. Subclasses define
+    Order: configure, post_configure | set_save_dir | Lightning's hooks. Subclasses define
     configure, training_step and so on, and may define update_step(epoch, step), called before each batch.
     """
 
@@ -61,7 +61,7 @@ class BaseSystem(LightningModule):
         loss: dict = field(default_factory=dict)
         optimizer: dict = field(default_factory=dict)
         scheduler: dict | None = None
-        weights: str | None = None  # a checkpoint whose weights are taken at the start, by name, where names agree
+        weights: str | None = None  # keys of the host's that nothing of ours can follow; train/base.py refuses them
         weights_ignore_modules: list[str] | None = None
         cleanup_after_validation_step: bool = False
         cleanup_after_test_step: bool = False
@@ -75,8 +75,6 @@ class BaseSystem(LightningModule):
         self._resumed, self._resumed_at = resumed, None
         self._loggers = self._make_loggers()
         self.configure()
-        if self.cfg.weights is not None:
-            self._load_weights(self.cfg.weights, self.cfg.weights_ignore_modules or [])
         self.post_configure()
 
     def configure(self) -> None:
@@ -84,11 +82,6 @@ class BaseSystem(LightningModule):
 
     def post_configure(self) -> None:
         """Called when the parts are built and hold their first weights."""
-
-    def _load_weights(self, path: str, ignored: list[str]) -> None:
-        saved = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-        prefixes = tuple(f"{name}." for name in ignored)
-        self.load_state_dict({k: v for k, v in saved.items() if not k.startswith(prefixes)}, strict=False)
 
     # --- where the run stands
 

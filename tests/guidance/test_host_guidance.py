@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields
 
 import pytest
@@ -11,7 +12,8 @@ from dreamcatalyst.diffusion.api import Row
 from dreamcatalyst.diffusion.noise import stable_diffusion_schedule
 from dreamcatalyst.errors import ConfigError, PriorError
 from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
-from dreamcatalyst.guidance.host import WITHOUT_EFFECT, HostConfig, content_key, prior_options
+from dreamcatalyst.guidance.host import content_key
+from dreamcatalyst.guidance.host_config import ALIASES, WITHOUT_EFFECT, HostConfig, prior_options
 from dreamcatalyst.guidance.timesteps import Schedule
 from omegaconf import OmegaConf
 
@@ -312,6 +314,47 @@ def test_the_keys_of_the_guidance_that_stood_there_are_taken(models):
     assert made("guidance", **every).settings() == made("guidance").settings()
 
 
+@pytest.mark.parametrize("kind", ["guidance", "edit-guidance"])
+@pytest.mark.parametrize(
+    "wrong, line",
+    [
+        ({"guidence_scale": 5}, "system.guidance: unknown key 'guidence_scale'. Did you mean 'guidance_scale'?"),
+        ({"prior": {"s_imge": 0.1}}, "system.guidance.prior: unknown key 's_imge'. Did you mean 's_image'?"),
+        ({"guidance_scale": [1, 2]}, "system.guidance.guidance_scale: got [1, 2] (list), expected float."),
+        ({"max_steps": "many"}, "system.guidance.max_steps: got 'many' (str), expected int."),
+        ({"max_step_percent": [0.9, 0.5]}, "system.guidance.max_step_percent: a schedule of 2 numbers"),
+        ({"references": "nowhere"}, "system.guidance.references: 'nowhere' is no folder"),
+    ],
+)
+def test_a_wrong_key_or_value_is_found_when_the_host_builds_it(kind, wrong, line):
+    with pytest.raises(ConfigError, match=re.escape(line)):
+        made(kind, **wrong)
+
+
+def test_every_key_of_the_host_is_a_field_and_none_stands_in_two_tables():
+    names = {f.name for f in fields(HostConfig)}
+    ours = {f.name for f in fields(GuidanceConfig)}
+    assert {*ALIASES, *WITHOUT_EFFECT, *ours} <= names
+    assert not set(ALIASES) & set(WITHOUT_EFFECT) and not ours & {*ALIASES, *WITHOUT_EFFECT}
+
+
+def test_which_guidance_fits_which_system_is_said_by_the_one_that_does_not():
+    """A system takes the keys that it needs from the answer."""
+    answer = made("guidance")(picture(), picture(), Processor())
+    with pytest.raises(ConfigError, match="asks for edit_images, got loss_sds.*-edit-guidance gives edit_images"):
+        answer["edit_images"]
+    with pytest.raises(ConfigError, match="loss_name: this system asks for loss_dds, got loss_sds. Set it to dds"):
+        answer["loss_dds"]
+    edits = made("edit-guidance", prior=STEADY, diffusion_steps=2)
+    with pytest.raises(ConfigError, match="asks for loss_sds, got edit_images.* dreamcatalyst-guidance gives a loss"):
+        edits(picture(), picture(), Processor())["loss_sds"]
+    # A system that only goes through what it gets would train on without any loss of ours.
+    with pytest.raises(ConfigError, match="asks for a loss, got dreamcatalyst-edit-guidance"):
+        edits(picture(), Processor(), **BATCH, gt_rgb=picture(), rgb_as_latents=False)
+    with pytest.raises(ConfigError, match="max_steps.*dreamcatalyst-edit-guidance gives edit_images"):
+        made("guidance", max_steps=None)  # as where it stands in the place of a guidance that edits
+
+
 def test_the_hosts_names_for_the_priors_options():
     said = HostConfig(
         prior_type="ip2p", ip2p_name_or_path="a/b", half_precision_weights=True, freeu_b1=1.2,
@@ -320,6 +363,7 @@ def test_the_hosts_names_for_the_priors_options():
     assert prior_options(OmegaConf.structured(said)) == {
         "path": "a/b", "dtype": "fp16", "offload": False, "channels_last": True, "freeu": {"mode": "paper", "b1": 1.2},
     }  # fmt: skip
+    assert prior_options(OmegaConf.structured(HostConfig())) == {}
 
 
 @pytest.mark.parametrize("wrong", [{"rule": "dreamcatalist"}, {"timesteps": "uniforn"}, {"preset": "papers"}])

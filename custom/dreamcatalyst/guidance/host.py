@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,95 +18,33 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .. import plugin
-from ..config import Scalar
+from ..config import check, parse
 from ..diffusion.noise import stable_diffusion_schedule
 from ..errors import ConfigError
 from .fixed_point import check_sampler
 from .guidance import Guidance, GuidanceConfig, chosen_rule, chosen_schedule
+from .host_config import WITHOUT_EFFECT, HostConfig, prior_options
 from .rules import NOISE, SOURCE
 
-# Keys of the host's guidances for which there is nothing to do here. They are accepted, named once, and change nothing.
-WITHOUT_EFFECT = (
-    "pretrained_model_name_or_path",  # of its text-to-image model; ours is prior.path
-    "ddim_scheduler_name_or_path",  # the noise schedule is the one in the prior's folder
-    "cache_dir",  # HF_HOME says where downloads are kept
-    "enable_memory_efficient_attention",  # torch's attention is
-    "enable_attention_slicing",
-    "weighting_strategy",  # the rule says it
-    "use_sds",  # which of the two guidances is chosen says it
-    "use_dds",
-    "use_dreamcatalyst",
-    "use_sjc",
-    "use_img_loss",
-    "var_red",
-    "grad_clip",  # gradients are never changed; one that is not finite is an error
-    "sqrt_anneal",
-    "control_type",
+PICTURES = (".png", ".jpg", ".jpeg")
+WHICH = (
+    "dreamcatalyst-edit-guidance gives edit_images, for systems that replace their pictures by edited ones "
+    "(instructnerf2nerf-system, control4d-multiview-system); dreamcatalyst-guidance gives a loss, for systems that add "
+    "one at every step (dreamfusion-system and its like)"
 )
 
 
-def thawed(cls: type) -> type:
-    """The fields of a frozen dataclass in one that is not: the host's configs are not, and may not inherit one."""
-    made = {}
-    for f in fields(cls):
-        made[f.name] = (
-            field(default=f.default) if f.default_factory is MISSING else field(default_factory=f.default_factory)
-        )
-    return make_dataclass(cls.__name__, [(f.name, f.type, made[f.name]) for f in fields(cls)])
+class Answer(dict):
+    """What the host gets. Asked for what is not in it, it says which guidance gives that."""
 
-
-WithoutEffect = make_dataclass("WithoutEffect", [(name, Any, None) for name in WITHOUT_EFFECT])
-
-
-@dataclass
-class HostConfig(WithoutEffect, thawed(GuidanceConfig)):
-    """All of GuidanceConfig, and what a guidance in the host must be told besides.
-
-    max_steps: the length of the run, over which a decreasing schedule of timesteps goes; a guidance cannot see the
-        trainer, so YAMLs give ${trainer.max_steps}. max_iteration: its name in the published code.
-    prompt, source_prompt: words for the prior's own text encoder; empty: the host's prompt processor is asked.
-    view_dependent_prompting: ask it for the texts of the batch's viewing angles.
-    loss_name: of the loss that is returned, "loss_<name>"; the system's YAML must have loss.lambda_<name>.
-    references: a folder of source images, in the order of the views' `index`, for systems that pass none.
-    fixed_size: images are resized to so many pixels square before they are encoded; -1: they are taken as they are.
-    ip2p_name_or_path, half_precision_weights, enable_sequential_cpu_offload, enable_channels_last_format, freeu_*: the
-        host's names for prior.path, prior.dtype, prior.offload, prior.channels_last and prior.freeu; these go first.
-    """
-
-    prior_type: str = "ip2p"
-    reduction: str = "sum"  # as the host's: its other losses are weighted against that
-    min_step_percent: Scalar | None = None  # here it may also be a schedule over the host's steps
-    max_step_percent: Scalar | None = None
-    max_steps: int | None = None
-    max_iteration: int | None = None
-    prompt: str = ""
-    source_prompt: str = ""
-    view_dependent_prompting: bool = False
-    loss_name: str = "sds"
-    references: str = ""
-    fixed_size: int = -1
-    ip2p_name_or_path: str | None = None
-    half_precision_weights: bool | None = None
-    enable_sequential_cpu_offload: bool = False
-    enable_channels_last_format: bool = False
-    freeu_b1: float | None = None
-    freeu_b2: float | None = None
-    freeu_s1: float | None = None
-    freeu_s2: float | None = None
-
-
-def prior_options(cfg: Any) -> dict[str, Any]:
-    """The prior's options that a HostConfig says in the host's words, overridden by those that it says in ours."""
-    freeu = {name: cfg[f"freeu_{name}"] for name in ("b1", "b2", "s1", "s2") if cfg[f"freeu_{name}"] is not None}
-    half = cfg.half_precision_weights
-    said = {
-        "path": cfg.ip2p_name_or_path,
-        "dtype": None if half is None else ("fp16" if half else "fp32"),
-        "offload": cfg.enable_sequential_cpu_offload or None,
-        "channels_last": cfg.enable_channels_last_format or None,
-        "freeu": {"mode": "paper", **freeu} if freeu else None,
-    }
-    return {**{name: value for name, value in said.items() if value is not None}, **cfg.prior}
+    def __missing__(self, key: str) -> Any:
+        name = key.removeprefix("loss_")
+        ours = [given for given in self if given.startswith("loss_")]
+        if ours and name != key:
+            raise ConfigError(
+                f"system.guidance.loss_name: this system asks for {key}, got {ours[0]}. Set it to {name}."
+            )
+        raise ConfigError(f"system.guidance_type: this system asks for {key}, got {', '.join(self)}. {WHICH}.")
 
 
 class HostGuidance(plugin.BaseObject):
@@ -122,16 +60,25 @@ class HostGuidance(plugin.BaseObject):
     Config = HostConfig
     cfg: HostConfig
 
+    def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any):
+        # The host's own parser knows neither the nearest key nor ranges.
+        check(type(self), cfg, "system.guidance")
+        super().__init__(cfg or {}, *args, **kwargs)
+
     def configure(self) -> None:
         self._epoch = self._step = 0
-        self._references: list[Path] | None = None
-        self.rule = chosen_rule(self.settings())
-        self.schedule = chosen_schedule(self.settings(), self.rule)
-        unused = [f"system.guidance.{name}" for name in WITHOUT_EFFECT if self.cfg[name] is not None]
+        ours = {f.name: self.cfg[f.name] for f in fields(GuidanceConfig)} | {"prior": prior_options(self.cfg)}
+        self._settings: GuidanceConfig = parse(GuidanceConfig, {**ours, **self._limits()}, "system.guidance")
+        self.rule = chosen_rule(self._settings)
+        self.schedule = chosen_schedule(self._settings, self.rule)
+        self._references = self._find_references()
+        unused = [
+            f"system.guidance.{name} ({why})" for name, why in WITHOUT_EFFECT.items() if self.cfg[name] is not None
+        ]
         if unused:
-            plugin.info(f"{', '.join(unused)}: keys of another guidance, which have no effect on {type(self).__name__}")
+            plugin.info(f"keys of another guidance, which have no effect on {type(self).__name__}: {', '.join(unused)}")
         self.check()
-        self._guidance = Guidance(self.settings(), self.cfg.prompt, self.cfg.source_prompt, self.device)
+        self._guidance = Guidance(self._settings, self.cfg.prompt, self.cfg.source_prompt, self.device)
 
     def check(self) -> None:
         """What can be said of the settings before the prior is loaded. Raises ConfigError."""
@@ -144,15 +91,16 @@ class HostGuidance(plugin.BaseObject):
         """The limits of the noise level from now on; some of the host's systems set them."""
         self.cfg.min_step_percent, self.cfg.max_step_percent = min_step_percent, max_step_percent
 
-    def settings(self) -> GuidanceConfig:
-        """The guidance's config at this moment: its limits may follow a schedule."""
-        ours = {f.name: self.cfg[f.name] for f in fields(GuidanceConfig)}
-        for name in ("min_step_percent", "max_step_percent"):
-            if ours[name] is not None:
-                ours[name] = plugin.C(ours[name], self._epoch, self._step)
-        return GuidanceConfig(**{**ours, "prior": prior_options(self.cfg)})
+    def _limits(self) -> dict[str, float]:
+        """The limits of the noise level at this moment, those that are set: they may follow a schedule."""
+        names = [name for name in ("min_step_percent", "max_step_percent") if self.cfg[name] is not None]
+        return {name: plugin.C(self.cfg[name], self._epoch, self._step) for name in names}
 
-    def __call__(self, rgb: Tensor, *args: Any, **batch: Any) -> dict[str, Any]:
+    def settings(self) -> GuidanceConfig:
+        """The guidance's config at this moment."""
+        return replace(self._settings, **self._limits())
+
+    def __call__(self, rgb: Tensor, *args: Any, **batch: Any) -> Answer:
         for flag in ("rgb_as_latents", "guidance_eval", "test_info"):
             if batch.get(flag):
                 raise ConfigError(
@@ -165,7 +113,7 @@ class HostGuidance(plugin.BaseObject):
         sources = self._sources(args, batch, images)
         self._set_text(guidance, [a for a in (*args, *batch.values()) if hasattr(a, "get_text_embeddings")], batch)
         views = list(range(len(rgb))) if sources is None else [content_key(source) for source in sources]
-        return self.answer(guidance, images, sources, views, rgb)
+        return Answer(self.answer(guidance, images, sources, views, rgb))
 
     def answer(
         self, guidance: Guidance, images: Tensor, sources: Tensor | None, views: list[int], rgb: Tensor
@@ -187,7 +135,7 @@ class HostGuidance(plugin.BaseObject):
 
     def _sources(self, args: Sequence[Any], batch: dict[str, Any], images: Tensor) -> Tensor | None:
         given = next((a for a in args if isinstance(a, Tensor)), batch.get("gt_rgb"))
-        if given is None and self.cfg.references and "index" in batch:
+        if given is None and self._references and "index" in batch:
             given = self._reference(batch["index"])
         if given is None and (self.rule.reference != NOISE or self._guidance.prior.takes_image):
             raise ConfigError(
@@ -198,18 +146,27 @@ class HostGuidance(plugin.BaseObject):
             )
         return None if given is None else self._resized(given.detach().to(images), images.shape[1:3])
 
+    def _find_references(self) -> list[Path]:
+        if not self.cfg.references:
+            return []
+        folder = Path(self.cfg.references).expanduser()
+        found = sorted(p for p in folder.glob("*") if p.suffix.lower() in PICTURES)
+        if not found:
+            fault = "holds none" if folder.is_dir() else "is no folder"
+            raise ConfigError(
+                f"system.guidance.references: '{folder}' {fault}, expected images ({', '.join(PICTURES)})."
+            )
+        return found
+
     def _reference(self, index: int | Tensor) -> Tensor:
         """The reference images [B,H,W,3] of the views `index`."""
         from PIL import Image
 
-        folder = Path(self.cfg.references)
-        if self._references is None:
-            self._references = sorted(p for p in folder.glob("*") if p.suffix.lower() in (".png", ".jpg", ".jpeg"))
         views = torch.as_tensor(index).reshape(-1).tolist()
         if max(views) >= len(self._references):
             raise ConfigError(
-                f"system.guidance.references: '{folder}' holds {len(self._references)} images, and that of view "
-                f"{max(views)} is asked for (counted from 0)"
+                f"system.guidance.references: '{self.cfg.references}' holds {len(self._references)} images, and that "
+                f"of view {max(views)} is asked for (counted from 0)"
             )
         loaded = [np.asarray(Image.open(self._references[view]).convert("RGB"), np.float32) / 255 for view in views]
         return torch.from_numpy(np.stack(loaded))
@@ -267,7 +224,7 @@ class LossGuidance(HostGuidance):
             raise ConfigError(
                 f"system.guidance.max_steps: timesteps of policy '{self.schedule.policy}' go down over the run, and a "
                 "guidance cannot see how long that is. Add 'system.guidance.max_steps=${trainer.max_steps}' (in these "
-                "quotes), or system.guidance.timesteps=uniform."
+                f"quotes), or system.guidance.timesteps=uniform. Or is it the other guidance that is meant? {WHICH}."
             )
 
     def answer(
@@ -298,6 +255,13 @@ class EditGuidance(HostGuidance):
         made = self._guidance
         if made.prior.exact and self.rule.delivers == "gradient":
             check_sampler(made.prior, self.rule, made.sampler_timesteps, *made.scales)
+
+    def __call__(self, rgb: Tensor, *args: Any, **batch: Any) -> Answer:
+        if "rgb_as_latents" in batch:  # only systems that want a loss say this, and would go on without any
+            raise ConfigError(
+                f"system.guidance_type: this system asks for a loss, got dreamcatalyst-edit-guidance. {WHICH}."
+            )
+        return super().__call__(rgb, *args, **batch)
 
     @torch.no_grad()
     def answer(

@@ -61,6 +61,7 @@ class SplatData(plugin.pl.LightningDataModule):
         self.cfg = parse(self.Config, cfg or {}, "data")
         self.capture: Capture | None = None
         self.world: World | None = None
+        self._origins: dict[str, Origin] = {}
         if self.cfg.source and self.cfg.source.startswith(PREFIX):
             self.world = make_world(self.cfg.source.removeprefix(PREFIX))
 
@@ -87,7 +88,12 @@ class SplatData(plugin.pl.LightningDataModule):
 
     def origin(self, splats: str = "") -> Origin:
         """The point of the files' world that is (0,0,0) in this run, the same for cameras and splats: of the capture,
-        or where there is none, of the PLY `splats`."""
+        or where there is none, of the PLY `splats`, which is read once."""
+        if splats not in self._origins:
+            self._origins[splats] = self._find_origin(splats)
+        return self._origins[splats]
+
+    def _find_origin(self, splats: str) -> Origin:
         if self.world is not None or not (self.cfg.source or splats):
             return ZERO
         if self.cfg.source or cameras_beside(Path(splats)) is not None:

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from .. import plugin
-from ..config import parse
 from ..data.camera import Cameras
 from ..data.views import Capture
 from ..diffusion.noise import keyed_generator
@@ -27,6 +26,7 @@ from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
 from ..scene.ply import read_ply, write_ply
 from . import results, scores, summary
+from .base import System
 from .densify import STATISTICS, DensifyConfig, densify, observe, reset_opacity, screen_statistics
 from .finite import give_back, gradient_norms, kept_copy, leave_out, require_finite
 from .optim import LearningRates
@@ -36,7 +36,7 @@ from .renderer import RendererConfig
 from .results import ReportConfig
 
 
-class SplatSystem(plugin.BaseSystem):
+class SplatSystem(System):
     """Base of the fit and the edit system. Subclasses say where the scene comes from, what the loss of a step is, and
     against which images it is measured: `first_scene`, `step_loss`, `references`."""
 
@@ -48,7 +48,7 @@ class SplatSystem(plugin.BaseSystem):
     }
 
     @dataclass
-    class Config(plugin.BaseSystem.Config):
+    class Config(System.Config):
         gs_source: str = ""  # a PLY of splats to begin with
         drop_nonfinite: bool = False  # leave NaN and Inf rows of the PLY out, instead of refusing it
         nonfinite: str = "stop"  # a step with a NaN or Inf ends the run, or is left out and counted: stop | skip
@@ -95,8 +95,7 @@ class SplatSystem(plugin.BaseSystem):
     # --- setting up
 
     def configure(self) -> None:
-        self.automatic_optimization = False
-        self.part = {name: parse(cls, getattr(self.cfg, name), f"system.{name}") for name, cls in self.parts.items()}
+        super().configure()
         self.splats: Splats | None = None
         self.generations: Generations | None = None  # of hierarchical splats, where a subclass keeps them
         self._frozen: tuple[Gaussians | None, Frozen | None] = None, None
@@ -119,6 +118,8 @@ class SplatSystem(plugin.BaseSystem):
             return read_ply(self.cfg.gs_source, drop_nonfinite=self.cfg.drop_nonfinite, origin=self.origin)
         if self.data.world is not None:
             return self.data.world.scene
+        if self.data.cfg.source:  # where that is wrong, too, it is the first thing to say
+            self.data.open()
         raise ConfigError(
             "system.gs_source: no splats are given. Name a PLY; configs/fit.yaml makes one from photographs."
         )

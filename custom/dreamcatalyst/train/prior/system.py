@@ -17,11 +17,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ... import plugin
-from ...config import parse
 from ...diffusion.ip2p import InstructPix2Pix, Ip2pConfig
 from ...diffusion.noise import keyed_generator, stable_diffusion_schedule
 from ...errors import ConfigError, DataError, NumericalError
 from ...report.pictures import write_png
+from ..base import System
 from .data import PriorData
 from .folder import write_prior
 from .judge import SamplesConfig, edit_rows, judge_pairs, reconstruction_rows, score_table, sheet
@@ -54,7 +54,7 @@ class Progress:
 
 
 @plugin.register("dreamcatalyst-prior-system")
-class PriorSystem(plugin.BaseSystem):
+class PriorSystem(System):
     """Trains in two stages; `ema` holds the weights that are kept, and is what is sampled, encoded with and written.
 
     What a step draws is a function of the seed and its number, so that a resumed run has the bits of an uninterrupted
@@ -69,7 +69,7 @@ class PriorSystem(plugin.BaseSystem):
     }
 
     @dataclass
-    class Config(plugin.BaseSystem.Config):
+    class Config(System.Config):
         seed: int = 0
         autoencoder: dict = field(default_factory=dict)
         text: dict = field(default_factory=dict)
@@ -79,8 +79,7 @@ class PriorSystem(plugin.BaseSystem):
     # --- setting up
 
     def configure(self) -> None:
-        self.automatic_optimization = False
-        self.part = {name: parse(cls, getattr(self.cfg, name), f"system.{name}") for name, cls in self.parts.items()}
+        super().configure()
         self.progress = {name: Progress() for name in STAGES}
         self.networks: nn.ModuleDict | None = None
         self.latents: dict[str, Tensor] | None = None
