@@ -15,6 +15,8 @@ from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.scene.ply import write_ply
 from omegaconf import OmegaConf
 
+import launch
+
 ROOT = Path(__file__).resolve().parent.parent
 STEPS = 2
 
@@ -213,7 +215,7 @@ def test_a_clone_in_custom_offers_names_and_configs_whatever_it_is_called(tmp_pa
 def test_a_clone_and_a_link_register_once_and_the_second_says_which_to_remove(tmp_path, first):
     """The host imports in any order."""
     host = new_host(tmp_path / "threestudio")
-    clone(host, "cloned"), link(host)
+    link(host), clone(host, "cloned")
     names = ["cloned", "dreamcatalyst"] if first == "clone" else ["dreamcatalyst", "cloned"]
     listing = f"Path.iterdir = lambda self, names={names}: iter([self / name for name in names])"
     told = python(
@@ -227,6 +229,13 @@ def test_a_clone_and_a_link_register_once_and_the_second_says_which_to_remove(tm
     assert f"used: {used} {used}" in told
     assert f"custom: {names[0]}\n" in told and f"custom: {names[1]} (IMPORT FAILED)" in told
     assert f"dreamcatalyst is in custom/ twice: {used}, which is used, and {other}. Remove one" in told
+
+
+def test_where_a_clone_is_nothing_is_linked(tmp_path, capsys):
+    folder = clone(new_host(tmp_path / "threestudio"), "threestudio-dreamcatalyst")
+    assert launch.main(["--link", str(tmp_path / "threestudio")]) == 2
+    assert f"--link: '{folder}' is a clone of this extension" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "threestudio" / "custom").iterdir()] == [folder.name]
 
 
 # --- runs in a host

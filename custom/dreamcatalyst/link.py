@@ -12,11 +12,17 @@ from .errors import ConfigError
 def link(source: Path, target: Path, host: Path) -> None:
     """Make `target`, a path in the threestudio folder `host`, a symlink to the folder `source`; a copy, with a notice,
     where the file system has no symlinks. Linking twice changes nothing. Raises ConfigError where `host` is no
-    threestudio, or `target` is there and is something else.
+    threestudio, or `target` is there and is something else, or a clone of this repository is in the host's custom/.
     """
     lacking = [name for name in ("launch.py", "threestudio", "custom") if not (host / name).exists()]
     if lacking:
         raise ConfigError(f"--link: '{host}' is no threestudio folder: it has no {' and no '.join(lacking)}.")
+    clone = next(host.glob(f"custom/*/custom/{target.name}/__init__.py"), None)
+    if clone is not None:
+        raise ConfigError(
+            f"--link: '{clone.parents[2]}' is a clone of this extension, which threestudio loads as it is; its configs "
+            f"are in '{clone.parents[2] / 'configs'}'. Remove it to link another one."
+        )
     if target.is_symlink() and target.resolve() == source.resolve():
         print(f"{target} is linked already")
     elif target.is_dir() and not target.is_symlink() and _same(source, target):

@@ -32,6 +32,27 @@ def test_a_wrong_key_is_one_line_wherever_it_stands(name):
             cls(config(name, **{section: {"no_such_key": 1}}))
 
 
+@pytest.mark.parametrize(
+    "section, line",
+    [
+        (
+            {"guidance": {"prior": {"s_imge": 1}}},
+            "system.guidance.prior: unknown key 's_imge'. Did you mean 's_image'?",
+        ),
+        (
+            {"guidance": {"prior_type": "ip2"}},
+            "system.guidance.prior_type: unknown diffusion prior 'ip2'. Did you mean",
+        ),
+        ({"mask": {"kind": "boxx"}}, "system.mask: kind: unknown kind of mask 'boxx'. Did you mean 'box'?"),
+        ({"mask": {"kind": "box", "options": {"centre": [0, 0, 0]}}}, "system.mask.options: unknown key 'centre'."),
+        ({"mask": {"kind": "box", "options": {"radius": 1}}}, "system.mask.options: got radius, expected one of"),
+    ],
+)
+def test_what_a_kind_of_part_takes_is_looked_at_before_anything_is_made(section, line):
+    with pytest.raises(ConfigError, match=re.escape(line)):
+        plugin.find("dreamcatalyst-edit-system")(config("edit-system", **section))
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_weights_that_would_load_nothing_are_refused_with_the_remedy(name):
     with pytest.raises(ConfigError, match=r"system.weights: got 'a.ckpt'.*resume=.*system.gs_source="):

@@ -79,6 +79,12 @@ def chosen_rule(config: GuidanceConfig) -> Rule:
     return get_rule(config.rule, config.preset, **{k: v for k, v in given.items() if v is not None})
 
 
+def chosen_prior(config: GuidanceConfig) -> tuple[type[Prior], Any]:
+    """The prior's class and its options; nothing is loaded. Raises ConfigError."""
+    cls = PRIORS.get(config.prior_type, "system.guidance.prior_type")
+    return cls, parse(cls.Config, config.prior, "system.guidance.prior")
+
+
 def chosen_schedule(config: GuidanceConfig, rule: Rule) -> Schedule:
     """The timesteps of a run. Raises ConfigError."""
     policy = config.timesteps or rule.timesteps
@@ -99,8 +105,8 @@ class Guidance:
         self.schedule = chosen_schedule(config, self.rule)
         choose("kind of noise", config.noise, NOISES, "system.guidance.noise")
         choose("reduction", config.reduction, ("mean", "sum"), "system.guidance.reduction")
-        prior_class = PRIORS.get(config.prior_type, "system.guidance.prior_type")
-        self.prior: Prior = prior_class(parse(prior_class.Config, config.prior, "system.guidance.prior"), device=device)
+        prior_class, options = chosen_prior(config)
+        self.prior: Prior = prior_class(options, device=device)
         check_prior(self.rule, self.prior)
         if self.rule.delivers == "known edit" and not self.prior.exact:
             raise PriorError(

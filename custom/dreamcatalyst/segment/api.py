@@ -61,6 +61,12 @@ class MaskConfig:
         if self.kind == NONE and (self.options or self.invert):
             raise ConfigError(f"kind: none takes no options and no invert. Known: {', '.join(SEGMENTERS.names())}.")
 
+    def segmenter(self) -> Segmenter | None:
+        """The kind with its options, None for none. Raises ConfigError for options that cannot be."""
+        if self.kind == NONE:
+            return None
+        return parse(SEGMENTERS.get(self.kind), self.options, "system.mask.options")
+
 
 @dataclass(frozen=True)
 class MaskRequest:
@@ -124,9 +130,9 @@ def make_mask(config: MaskConfig, request: MaskRequest, folder: Path | None = No
     all that made them; threshold, grow, invert and feather come after, so that trying others of them costs nothing.
     Raises ConfigError for options that cannot be, SceneError for an empty mask, and what the segmenter raises.
     """
-    if config.kind == NONE:
+    segmenter = config.segmenter()
+    if segmenter is None:
         return None
-    segmenter: Segmenter = parse(SEGMENTERS.get(config.kind), config.options, "system.mask.options")
     folder = Path(config.cache).expanduser() if config.cache else folder
     key = cache.digest(cache.code(), *_made_of(config, segmenter, request)) if folder else ""
     found = cache.load(folder, key) if folder else None

@@ -15,7 +15,7 @@ from ..cache import ByteCache
 from ..data.camera import Cameras
 from ..demo.edits import normalised
 from ..errors import ConfigError, SceneError, choose
-from ..guidance.guidance import Guidance, GuidanceConfig
+from ..guidance.guidance import Guidance, GuidanceConfig, chosen_prior
 from ..loss.anchor import AnchorConfig, anchor_loss, anchor_step
 from ..loss.perceptual import Lpips
 from ..render.api import Render
@@ -116,6 +116,8 @@ class EditSystem(SplatSystem):
         super().configure()
         if self.cfg.mode:
             choose("mode", self.cfg.mode, self.cfg.steps, "system.mode")
+        chosen_prior(self.part["guidance"])  # what the kinds of prior and mask take is looked at before any is made
+        self.part["mask"].segmenter()
         self.guidance: Guidance | None = None
         self.source: Gaussians | None = None
         self.truth: Truth | None = None
