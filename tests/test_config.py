@@ -12,6 +12,7 @@ from dreamcatalyst.config import (
     ExperimentConfig,
     Scalar,
     check,
+    corners,
     largest,
     load_config,
     parse,
@@ -193,6 +194,7 @@ def test_a_piecewise_schedule_is_the_polyline_through_its_corners(gaps, step):
         expected = values[i] * (1 - along) + values[i + 1] * along
     assert math.isclose(value(schedule, 0, step), expected, abs_tol=1e-9)
     assert largest(schedule) == max(values)
+    assert [value(schedule, t, t) for t in corners(schedule)] == pytest.approx(values)
 
 
 # --- the experiment

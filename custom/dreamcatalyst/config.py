@@ -201,6 +201,11 @@ def largest(scalar: Scalar | Sequence) -> float:
     return scalar if _number(scalar) else max(v for _, v in _knots(_scalar(scalar, "schedule")))
 
 
+def corners(scalar: Scalar | Sequence) -> list[int | float]:
+    """The times at which the pieces of a schedule begin and end, in steps or epochs; [0] for a number."""
+    return [0] if _number(scalar) else [time for time, _ in _knots(_scalar(scalar, "schedule"))]
+
+
 # --- the experiment --------------------------------------------------------------------------------------------------
 
 

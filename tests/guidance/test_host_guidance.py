@@ -294,7 +294,7 @@ def test_an_edit_runs_on_a_learned_prior_at_a_size_that_is_no_multiple_of_eight(
 # --- the config
 
 
-def test_our_own_keys_are_all_there_with_our_defaults_but_for_three():
+def test_our_own_keys_are_all_there_with_our_defaults_but_for_two():
     hosted = {f.name: f.default for f in fields(HostConfig)}
     differing = {f.name for f in fields(GuidanceConfig) if hosted[f.name] != f.default}
     assert differing == {"prior_type", "reduction"}
@@ -323,6 +323,7 @@ def test_the_keys_of_the_guidance_that_stood_there_are_taken(models):
         ({"guidance_scale": [1, 2]}, "system.guidance.guidance_scale: got [1, 2] (list), expected float."),
         ({"max_steps": "many"}, "system.guidance.max_steps: got 'many' (str), expected int."),
         ({"max_step_percent": [0.9, 0.5]}, "system.guidance.max_step_percent: a schedule of 2 numbers"),
+        ({"max_step_percent": [0.9, 1.5, 1000]}, "max_step_percent 1.5 must be fractions"),  # not only at step 1000
         ({"references": "nowhere"}, "system.guidance.references: 'nowhere' is no folder"),
     ],
 )

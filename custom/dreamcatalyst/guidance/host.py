@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .. import plugin
-from ..config import check, parse
+from ..config import check, corners, parse
 from ..diffusion.noise import stable_diffusion_schedule
 from ..errors import ConfigError
 from .fixed_point import check_sampler
@@ -26,6 +26,7 @@ from .guidance import Guidance, GuidanceConfig, chosen_rule, chosen_schedule
 from .host_config import WITHOUT_EFFECT, HostConfig, prior_options
 from .rules import NOISE, SOURCE
 
+LIMITS = ("min_step_percent", "max_step_percent")
 PICTURES = (".png", ".jpg", ".jpeg")
 WHICH = (
     "dreamcatalyst-edit-guidance gives edit_images, for systems that replace their pictures by edited ones "
@@ -68,9 +69,11 @@ class HostGuidance(plugin.BaseObject):
     def configure(self) -> None:
         self._epoch = self._step = 0
         ours = {f.name: self.cfg[f.name] for f in fields(GuidanceConfig)} | {"prior": prior_options(self.cfg)}
-        self._settings: GuidanceConfig = parse(GuidanceConfig, {**ours, **self._limits()}, "system.guidance")
+        self._settings: GuidanceConfig = parse(GuidanceConfig, {**ours, **self._limits(0, 0)}, "system.guidance")
         self.rule = chosen_rule(self._settings)
         self.schedule = chosen_schedule(self._settings, self.rule)
+        for time in {time for name in LIMITS if self.cfg[name] is not None for time in corners(self.cfg[name])}:
+            chosen_schedule(replace(self._settings, **self._limits(time, time)), self.rule)  # where they are extreme
         self._references = self._find_references()
         unused = [
             f"system.guidance.{name} ({why})" for name, why in WITHOUT_EFFECT.items() if self.cfg[name] is not None
@@ -91,14 +94,14 @@ class HostGuidance(plugin.BaseObject):
         """The limits of the noise level from now on; some of the host's systems set them."""
         self.cfg.min_step_percent, self.cfg.max_step_percent = min_step_percent, max_step_percent
 
-    def _limits(self) -> dict[str, float]:
-        """The limits of the noise level at this moment, those that are set: they may follow a schedule."""
-        names = [name for name in ("min_step_percent", "max_step_percent") if self.cfg[name] is not None]
-        return {name: plugin.C(self.cfg[name], self._epoch, self._step) for name in names}
+    def _limits(self, epoch: int, step: int) -> dict[str, float]:
+        """The limits of the noise level that are set; they may follow a schedule."""
+        set_here = [name for name in LIMITS if self.cfg[name] is not None]
+        return {name: plugin.C(self.cfg[name], epoch, step) for name in set_here}
 
     def settings(self) -> GuidanceConfig:
         """The guidance's config at this moment."""
-        return replace(self._settings, **self._limits())
+        return replace(self._settings, **self._limits(self._epoch, self._step))
 
     def __call__(self, rgb: Tensor, *args: Any, **batch: Any) -> Answer:
         for flag in ("rgb_as_latents", "guidance_eval", "test_info"):
