@@ -10,7 +10,7 @@ from dreamcatalyst.diffusion.closed_form import noise_slope
 from dreamcatalyst.errors import ConfigError, PriorError
 from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
 from dreamcatalyst.segment.api import MaskConfig, make_mask
-from dreamcatalyst.segment.relevance import Relevance, normalised
+from dreamcatalyst.segment.relevance import Answer, Relevance, normalised
 
 from tests.diffusion.small_model import make_model
 
@@ -19,20 +19,34 @@ def test_it_is_the_edit_itself_for_a_prior_that_knows_it(disc_world):
     """Both predictions are linear in the noise, so that of a pair of signs k_s sqrt(abar) |T(I) - I| is left."""
     guidance, image = disc_world.request.guidance, disc_world.request.render(0).clamp(0, 1).double()
     options = Relevance(lowest=0.3, highest=0.9, timesteps=2, draws=1)
-    found = options.difference(guidance, image, 100)
+    answer = options.ask(guidance, image, 100, 1)
+    found = answer.relevance
     edit = 2 * (guidance.known_edit(image, 100) - image).abs().mean(dim=-1)
     scale = 0.0
     for t in (round(0.3 * 999), round(0.9 * 999)):
         abar = float(guidance.prior.alphas_cumprod[t])
         scale += noise_slope(abar, guidance.prior.config.s) * abar**0.5 / 2
     torch.testing.assert_close(found.double(), scale * edit, rtol=1e-5, atol=1e-6)
+    assert answer.noise.isnan().all()  # of one draw nothing is known of that
+    twice = options.ask(guidance, image, 100, 2)
+    assert twice.noise.max() < 1e-5 * twice.signal.max()  # this prior's predictions do not differ between draws
+
+
+def test_signal_and_noise_are_told_apart():
+    """Differences of 0.5 in all draws, with noise of 0.2 in each: 16 channels and 4 levels of a thousand pixels."""
+    noise = 0.2 * torch.randn(4, 8, 16, 25, 40, generator=torch.Generator().manual_seed(0))
+    nothing, something = Answer.of(noise), Answer.of(0.5 + noise)
+    assert something.noise.mean() == pytest.approx(0.2, rel=0.02)
+    assert something.signal.mean() == pytest.approx(0.5, rel=0.02)
+    torch.testing.assert_close(nothing.noise, something.noise, atol=1e-5, rtol=0)
+    assert nothing.signal.mean() < 0.02 < 0.15 < nothing.relevance.mean()
 
 
 def test_unpaired_noise_leaves_its_own_magnitude(disc_world):
     image = disc_world.request.render(0).clamp(0, 1)
-    paired = Relevance().difference(disc_world.request.guidance, image, 0)
-    plain = Relevance(noise="independent").difference(disc_world.request.guidance, image, 0)
-    assert plain.min() > paired.min() + 0.1
+    paired = Relevance().ask(disc_world.request.guidance, image, 0, 2)
+    plain = Relevance(noise="independent").ask(disc_world.request.guidance, image, 0, 2)
+    assert plain.relevance.min() > paired.relevance.min() + 0.1
 
 
 def test_outliers_are_clipped_at_the_fences():
@@ -58,20 +72,43 @@ def test_rounding_errors_of_an_untouched_background_are_no_mask():
     assert float((found > 0.5).sum()) == 100
 
 
-def plane(background: float) -> dict[int, torch.Tensor]:
-    """Relevance of 1 on a fifth of two views, of `background` elsewhere."""
+def plane(background: float, noise: float = 0.001) -> dict[int, Answer]:
+    """Differences of 1 on a fifth of two views, of `background` elsewhere, with `noise` between draws."""
     values = torch.full((20, 20), background)
     values[:4] = 1.0
-    return {0: values, 5: values.flip(0)}
+    return {view: Answer(m, m, torch.full_like(m, noise)) for view, m in {0: values, 5: values.flip(0)}.items()}
 
 
 def test_an_edit_of_everything_is_told_from_one_of_a_thing():
-    """What changes least is a share of what changes most, or next to nothing."""
+    """What changes least is a share of what changes most, and more than what noise draws differ by."""
     assert Relevance().concerns_all(plane(0.2)) and not Relevance().concerns_all(plane(0.04))
     assert not Relevance(everywhere=1).concerns_all(plane(0.9))
     assert not Relevance(noise="independent").concerns_all(plane(0.2))
-    faint = {view: 0.05 * values for view, values in plane(0.2).items()}  # a thing that is small, or hardly changes
-    assert not Relevance().concerns_all(faint)
+    assert not Relevance().concerns_all(plane(0.2, noise=0.1))  # as large as that it is for no edit, too
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.3, 3.0])
+def test_the_decision_is_free_of_scale(scale):
+    for background, noise in ((0.2, 0.001), (0.2, 0.1), (0.04, 0.001)):
+        given = plane(background, noise)
+        other = {v: Answer(*(scale * x for x in (a.relevance, a.signal, a.noise))) for v, a in given.items()}
+        assert Relevance().concerns_all(other) == Relevance().concerns_all(given)
+
+
+def test_an_edit_of_everything_costs_a_look_at_a_few_views(disc_world, monkeypatch):
+    """Every view is asked once; at most six are asked twice, and first; where these say everything, no other is."""
+    request, asked = dataclasses.replace(disc_world.request, render=lambda i: torch.zeros(20, 20, 3)), []
+    cameras = [request.cameras[0].resized(20, 20)] * 24
+    request = dataclasses.replace(request, cameras=cameras)
+    for everything in (False, True):
+        background, asked[:] = (0.3 if everything else 0.0), []
+        monkeypatch.setattr(
+            Relevance, "ask", lambda self, g, s, view, draws: asked.append((view, draws)) or plane(background)[0]
+        )
+        found = Relevance()(request, range(24))
+        assert set(found) == set(range(24)) and all(bool((m == 1).all()) for m in found.values()) == everything
+        first = [(view, 2) for view in range(0, 24, 4)]
+        assert asked == first if everything else asked == first + [(v, 1) for v in range(24) if v % 4]
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3])
@@ -96,7 +133,7 @@ def test_neural_priors_of_odd_sizes(prior, disc_world, tmp_path):
     options = {"timesteps": 2, "draws": 3, "lowest": 0.5, "highest": 0.7}
     mask = make_mask(MaskConfig(kind="relevance", options=options, views=2, threshold=1e-3), request)
     assert {tuple(m.shape) for m in mask.images.values()} == {(45, 53)}
-    assert calls == [(2, 6, 500), (2, 6, 699)] * 2  # both rows of all draws in one call
+    assert calls == [(2, 6, 500), (2, 6, 699)] * 2  # both rows of all draws, in both signs, in one call
 
 
 def test_without_a_prior_there_is_none(disc_world):
