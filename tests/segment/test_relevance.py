@@ -95,20 +95,20 @@ def test_the_decision_is_free_of_scale(scale):
         assert Relevance().concerns_all(other) == Relevance().concerns_all(given)
 
 
-def test_an_edit_of_everything_costs_a_look_at_a_few_views(disc_world, monkeypatch):
+@pytest.mark.parametrize(("background", "everything"), [(0.0, False), (0.3, True)])
+def test_an_edit_of_everything_costs_a_look_at_a_few_views(disc_world, monkeypatch, background, everything):
     """Every view is asked once; at most six are asked twice, and first; where these say everything, no other is."""
-    request, asked = dataclasses.replace(disc_world.request, render=lambda i: torch.zeros(20, 20, 3)), []
-    cameras = [request.cameras[0].resized(20, 20)] * 24
-    request = dataclasses.replace(request, cameras=cameras)
-    for everything in (False, True):
-        background, asked[:] = (0.3 if everything else 0.0), []
-        monkeypatch.setattr(
-            Relevance, "ask", lambda self, g, s, view, draws: asked.append((view, draws)) or plane(background)[0]
-        )
-        found = Relevance()(request, range(24))
-        assert set(found) == set(range(24)) and all(bool((m == 1).all()) for m in found.values()) == everything
-        first = [(view, 2) for view in range(0, 24, 4)]
-        assert asked == first if everything else asked == first + [(v, 1) for v in range(24) if v % 4]
+    cameras, asked = [disc_world.request.cameras[0].resized(20, 20)] * 24, []
+    request = dataclasses.replace(disc_world.request, cameras=cameras, render=lambda i: torch.zeros(20, 20, 3))
+
+    def answer(self, guidance, source, view, draws):
+        asked.append((view, draws))
+        return plane(background)[0]
+
+    monkeypatch.setattr(Relevance, "ask", answer)
+    found = Relevance()(request, range(24))
+    assert set(found) == set(range(24)) and all(bool((m == 1).all()) for m in found.values()) == everything
+    assert asked == [(v, 2) for v in range(0, 24, 4)] + [(v, 1) for v in range(24) if v % 4 and not everything]
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3])

@@ -153,3 +153,25 @@ def test_the_plan_says_what_is_left_out(launch, options, left_out):
     built = {part["name"] for part in plan["builds"]}
     assert not built & names
     assert plan["bytes"] == sum(part["bytes"] for part in plan["builds"])
+
+
+def test_frozen_splats_do_not_keep_an_edit_from_growing(launch, statue, caplog):
+    """A cap below the number of all splats, above that of the editable ones: it is reached, and said once."""
+    editable = int(inside(statue).sum())
+    cap = editable + 3
+    assert cap < len(statue)
+    trial = launch("closed-form.yaml", "trainer.max_steps=8", MASK, *GROWING, f"system.densify.max_splats={cap}")
+    assert len(read_ply(trial / "save" / "last.ply")) == len(statue) + 3
+    told = [record.getMessage() for record in caplog.records if "max_splats" in record.getMessage()]
+    (warned,) = [text for text in told if "have no room" in text]
+    assert f"system.densify.max_splats ({cap:,})" in warned
+    plan = json.loads((trial / "report" / "plan.json").read_text())
+    (note,) = [part["note"] for part in plan["builds"] if part["name"] == "densification"]
+    assert f"3 times, every 2 steps, up to {cap:,} editable splats" == note
+
+
+def test_the_plan_says_that_a_full_scene_is_not_densified(launch, statue):
+    trial = launch("closed-form.yaml", "trainer.max_steps=3", *GROWING, "system.densify.max_splats=100")
+    plan = json.loads((trial / "report" / "plan.json").read_text())
+    (note,) = [part["note"] for part in plan["builds"] if part["name"] == "densification"]
+    assert "removing only" in note and f"{len(statue):,} editable splats, max_splats 100" in note

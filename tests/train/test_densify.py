@@ -102,10 +102,16 @@ def test_screen_size_is_measured_before_it_is_reset():
 
 def test_the_largest_gradients_go_first():
     gradient = torch.tensor([0.6, 0.9, 0.0, 0.7, 0.8])
-    assert select(gradient, DensifyConfig(grad_threshold=0.5), 2).tolist() == [False, True, False, False, True]
-    assert select(gradient, DensifyConfig(grad_threshold=0.5, top_fraction=0.75), 99).tolist() == [0, 1, 0, 1, 1]
-    assert not select(gradient, DensifyConfig(grad_threshold=0.5), 0).any()
-    assert not select(torch.zeros(3), DensifyConfig(grad_threshold=0.0), 9).any()
+
+    def chosen(given, room, **options):
+        found, held_back = select(given, DensifyConfig(**{"grad_threshold": 0.5, **options}), room)
+        return found.tolist(), held_back
+
+    assert chosen(gradient, 2) == ([False, True, False, False, True], 2)
+    assert chosen(gradient, 99, top_fraction=0.75) == ([False, True, False, True, True], 0)
+    assert chosen(gradient, 1, top_fraction=0.75) == ([False, True, False, False, False], 2)
+    assert chosen(gradient, 0) == ([False] * 5, 4) == chosen(gradient, -7)
+    assert chosen(torch.zeros(3), 9, grad_threshold=0.0) == ([False] * 3, 0)
 
 
 def test_the_cap_holds():
@@ -183,10 +189,11 @@ def test_screen_gradients_of_frozen_splats_are_left_out():
         assert torch.equal(every.state[name], own.state[name])
 
 
-def test_the_cap_counts_frozen_splats():
-    splats = with_gradient(make_splats([0.01] * 10, editable=[True] * 4 + [False] * 6), [1.0] * 4)
-    densify(splats, DensifyConfig(grad_threshold=0.5, max_splats=12), 1.0, generator())
-    assert (len(splats), splats.total) == (6, 12)
+def test_the_cap_counts_editable_splats_alone():
+    """More frozen ones than the cap change nothing; it holds for those that cost gradients and moments."""
+    splats = with_gradient(make_splats([0.01] * 24, editable=[True] * 4 + [False] * 20), [1.0] * 4)
+    report = densify(splats, DensifyConfig(grad_threshold=0.5, max_splats=7), 1.0, generator())
+    assert (report.cloned, report.held_back) == (3, 1) and (len(splats), splats.total) == (7, 27)
 
 
 def test_an_object_may_vanish_where_other_splats_are_left():

@@ -6,7 +6,8 @@ from collections.abc import Callable
 import pytest
 import torch
 from dreamcatalyst.train import edit
-from dreamcatalyst.train.plan import Plan, readable, scene_bytes
+from dreamcatalyst.train.densify import DensifyConfig
+from dreamcatalyst.train.plan import Plan, density_steps, readable, scene_bytes
 
 from tests.train.test_confined import ANCHORED, MASK
 
@@ -111,6 +112,17 @@ def test_an_anchor_is_kept_for_what_weighs_only(run):
         "anchor_log_scales",
     }
     assert {"anchor of means", "anchor of sh0"} <= {p.name for p in plan.leaves_out}
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "max_steps", "times"),
+    [(100, 1201, 1500, 12), (100, 1200, 1500, 11), (100, 1201, 1200, 11), (1, 9, 1, 0), (500, 300, 900, 0)],
+)
+def test_times_of_densification(start, stop, max_steps, times):
+    """As the training counts: after so many steps, from start on, before stop, and not after the last."""
+    config = DensifyConfig(every=100, start=start, stop=stop)
+    after = [n for n in range(1, max_steps) if start <= n < stop and n % 100 == 0]
+    assert density_steps(config, max_steps) == len(after) == times
 
 
 def test_sizes_for_people():

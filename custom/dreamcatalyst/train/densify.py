@@ -37,17 +37,19 @@ class DensifyConfig:
     min_opacity: float = 0.005  # more transparent ones are removed
     max_size: float = 0.1  # larger ones are removed; 0: never
     max_radius: float = 0.0  # pixels: ones that were drawn larger since the last time are removed; 0: never
-    max_splats: int = 1_000_000  # cap on all, frozen ones too: the largest gradients go first, none is added beyond
+    max_splats: int = 1_000_000  # cap on editable ones (908 MiB at SH degree 3), the largest gradients go first; frozen
+    # ones, which take a quarter of that each and never grow in number, do not count
     reset_every: int = 0  # steps between two opacity resets; 0: never
 
 
 @dataclass(frozen=True)
 class DensifyReport:
-    """What one densification did, in numbers of splats."""
+    """What one densification did, in numbers of splats. held_back: for which max_splats left no room."""
 
     cloned: int = 0
     split: int = 0
     pruned: int = 0
+    held_back: int = 0
 
 
 def screen_statistics(splats: Splats) -> dict[str, Tensor]:
@@ -77,16 +79,18 @@ def observe(splats: Splats, render: Render, loss_scale: float = 1.0) -> None:
     splats.state["max_radius"] = torch.maximum(splats.state["max_radius"], radii.amax(0).to(size.dtype))
 
 
-def select(gradient: Tensor, config: DensifyConfig, room: int) -> Tensor:
-    """Which splats are densified, bool [N]: above the threshold, in the top fraction, no more than there is room."""
+def select(gradient: Tensor, config: DensifyConfig, room: int) -> tuple[Tensor, int]:
+    """Which splats are densified, bool [N]: above the threshold, in the top fraction, no more than there is room; and
+    how many more would be if there were."""
     chosen = gradient >= config.grad_threshold
     chosen &= gradient > 0
-    limit = min(math.ceil(config.top_fraction * int((gradient > 0).sum())), room)
+    wanted = min(math.ceil(config.top_fraction * int((gradient > 0).sum())), int(chosen.sum()))
+    limit = min(wanted, max(room, 0))
     if int(chosen.sum()) > limit:
         order = torch.argsort(torch.where(chosen, gradient, -1.0), descending=True, stable=True)
         chosen = torch.zeros_like(chosen)
-        chosen[order[: max(limit, 0)]] = True
-    return chosen
+        chosen[order[:limit]] = True
+    return chosen, wanted - limit
 
 
 def split_children(scene: Gaussians, generator: torch.Generator) -> dict[str, Tensor]:
@@ -122,8 +126,8 @@ def densify(
     gradient = state["grad_sum"] / state["grad_count"].clamp(min=1)
     largest = scene.scales.amax(-1)
     faint = scene.opacities < config.min_opacity
-    room = config.max_splats - splats.total + int(faint.sum())
-    chosen = select(torch.where(faint, 0.0, gradient), config, room)
+    room = config.max_splats - len(splats) + int(faint.sum())
+    chosen, held_back = select(torch.where(faint, 0.0, gradient), config, room)
     small = largest <= config.dense_size * extent
     clone, split = chosen & small, chosen & ~small
     gone = faint.clone()
@@ -145,7 +149,7 @@ def densify(
     if generations is not None:
         generations.advance(splats)
     splats.state.update(screen_statistics(splats))
-    return DensifyReport(len(cloned), len(halved), int(gone.sum()))
+    return DensifyReport(len(cloned), len(halved), int(gone.sum()), held_back)
 
 
 @torch.no_grad()

@@ -83,6 +83,7 @@ class EditDensifyConfig(DensifyConfig):
     """Density control of an edit: the source has large splats of its own, a sky for one, which are no mistake."""
 
     max_size: float = 0.0
+    max_splats: int = 5_000_000  # a scene of one's own may have millions to begin with; an edit adds few to them
 
 
 @plugin.register("dreamcatalyst-edit-system")

@@ -16,7 +16,7 @@ from ..loss.perceptual import WEIGHT_BYTES
 from ..scene.gaussians import PARAMETERS, Gaussians
 from ..scene.generations import GENERATION
 from ..segment.api import SEGMENTERS
-from .densify import STATISTICS
+from .densify import STATISTICS, DensifyConfig
 
 if TYPE_CHECKING:
     from .edit import EditSystem
@@ -108,10 +108,14 @@ class Draft:
         densify = system.part["densify"]
         if not densify.every:
             self.leave_out("densification", "densify.every is 0")
-        elif densify.start >= min(densify.stop, system.max_steps + 1):
+        elif (times := density_steps(densify, system.max_steps)) == 0:
             self.leave_out("densification", "it would start after the end of the run, or after densify.stop")
+        elif len(system.splats) >= densify.max_splats:
+            full = f"{len(system.splats):,} editable splats, max_splats {densify.max_splats:,}: raise it to add any"
+            self.add("densification", f"{times} times, removing only: densify has no room ({full})")
         else:
-            self.add("densification", f"every {densify.every} steps, up to {densify.max_splats:,} splats")
+            most = f"up to {densify.max_splats:,} editable splats"
+            self.add("densification", f"{times} times, every {densify.every} steps, {most}")
         self.leave_out("depth", "no output asks for it")
         pixels = batch * width * height
         return Plan(tuple(self.builds), tuple(self.leaves_out), self.network_rows, self.picture_rows, pixels)
@@ -133,6 +137,12 @@ class Draft:
         views = len(self.system.capture.views)
         most = min(self.system.part["renderer"].cache_mib * 2**20, views * view_bytes(len(splats.frozen), pixels))
         self.add("renders of frozen splats", "kept on the CPU, at most", most)
+
+
+def density_steps(config: DensifyConfig, max_steps: int) -> int:
+    """How often a run of `max_steps` densifies: not at its end, where nothing could come of it."""
+    last = min(config.stop, max_steps) - 1
+    return max(last // config.every - max(config.start - 1, 0) // config.every, 0)
 
 
 def view_bytes(frozen: int, pixels: int) -> int:

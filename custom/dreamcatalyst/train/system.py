@@ -104,6 +104,7 @@ class SplatSystem(System):
         self.record, self.plan_text = Record(self.part["report"]), ""
         self.judge: ClipJudge | None = None
         self._outcomes: dict[int, dict[str, float]] = {}
+        self._cap_announced = False
 
     def setup(self, stage: str) -> None:
         if self.splats is None:
@@ -260,9 +261,17 @@ class SplatSystem(System):
 
     def _density_control(self, step: int) -> None:
         config: DensifyConfig = self.part["densify"]
+        if step >= self.max_steps:  # what would be added then, or made opaque again, no step could improve
+            return
         if config.every and config.start <= step < config.stop and step % config.every == 0:
             generator = keyed_generator(self.cfg.seed, "split", step)
-            densify(self.splats, config, self.capture.extent, generator, self.generations)
+            done = densify(self.splats, config, self.capture.extent, generator, self.generations)
+            if done.held_back and not self._cap_announced:
+                self._cap_announced = True
+                plugin.warn(
+                    f"densification at step {step}: {done.held_back:,} splats to be divided have no room beside "
+                    f"{len(self.splats):,} editable ones; raise system.densify.max_splats ({config.max_splats:,})"
+                )
         if config.reset_every and step < config.stop and step % config.reset_every == 0:
             reset_opacity(self.splats)
 
