@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+import resource
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -13,3 +21,38 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class SmallDisk:
+    """A folder in which a process that calls `limit` at its start has little room. mounted: on a file system of its
+    own that is full then; else the process's files are limited in size, each for itself."""
+
+    folder: Path
+    size: int  # bytes
+    mounted: bool
+
+    def limit(self) -> None:
+        if not self.mounted:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, self.size))
+
+
+@contextmanager
+def mount(folder: Path, size: int) -> Iterator[SmallDisk]:
+    """`folder` as a disk of `size` bytes, as well as this machine lets us."""
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    mounted = shutil.which("mount") is not None and subprocess.run(command, capture_output=True).returncode == 0
+    try:
+        yield SmallDisk(folder, size, mounted)
+    finally:
+        if mounted:
+            subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """192 KiB."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    with mount(folder, 192 << 10) as disk:
+        yield disk

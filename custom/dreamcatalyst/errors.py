@@ -26,6 +26,14 @@ class PriorError(DreamCatalystError):
     """A diffusion prior that cannot be loaded or asked what was asked of it."""
 
 
+class FileError(DreamCatalystError):
+    """A file or folder that cannot be read or written. full: the file system has no room for it."""
+
+    def __init__(self, message: str, full: bool = False):
+        super().__init__(message)
+        self.full = full
+
+
 class NumericalError(DreamCatalystError):
     """A number that stopped being finite, with the place where it was first seen."""
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dreamcatalyst.errors import SceneError
+from dreamcatalyst.errors import FileError, SceneError
 from dreamcatalyst.scene.gaussians import SH_C0, Gaussians
 from dreamcatalyst.scene.ply import read_ply, write_ply
 from hypothesis import given, settings
@@ -180,7 +180,7 @@ def test_a_name_appears_only_when_the_file_is_complete(tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("dreamcatalyst.scene.ply.write_vertices", fails)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(FileError, match="a.ply: cannot be written: disk full"):
         write_ply(path, random_scene(7))
     assert path.read_bytes() == before and [p.name for p in path.parent.iterdir()] == ["a.ply"]
 

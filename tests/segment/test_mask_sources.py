@@ -177,20 +177,27 @@ def test_masks_are_kept_under_all_that_made_them(disc_world, tmp_path, monkeypat
         assert make(**change)[1] == 1, change
 
 
-@pytest.mark.parametrize("damage", ["cut short", "foreign", "no mask"])
+@pytest.mark.parametrize("damage", ["cut short", "one bit", "foreign", "no mask", "odd types"])
 def test_a_damaged_or_foreign_file_is_made_again(damage, disc_world, tmp_path, caplog):
     config = MaskConfig(kind="box", options={"center": [0.0, 0.0, 1.0], "radius": 0.7}, cache=str(tmp_path))
     first = make_mask(config, disc_world.request)
     (file,) = tmp_path.glob("*.pt")
     if damage == "cut short":
         file.write_bytes(file.read_bytes()[:100])
+    elif damage == "one bit":
+        middle = file.stat().st_size // 2
+        flipped = bytearray(file.read_bytes())
+        flipped[middle] ^= 1
+        file.write_bytes(flipped)
+    elif damage == "odd types":
+        torch.save({**torch.load(file, weights_only=True), "weights": torch.zeros(3, 3)}, file)
     elif damage == "foreign":
         kept = torch.load(file, weights_only=True)
         torch.save({**kept, "key": "another"}, file)
     else:
         torch.save([1, 2, 3], file)
     again = make_mask(config, disc_world.request)
-    assert f"{file}: is no mask that can be used" in caplog.text
+    assert str(file) in caplog.text and "The mask is made again" in caplog.text
     assert torch.equal(first.weights, again.weights)
     assert torch.equal(torch.load(file, weights_only=True)["weights"], first.weights)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..data.camera import Cameras
 from ..errors import DataError
+from ..files import replacing, write_text
 from ..render.api import rasterize
 from ..scene.gaussians import Gaussians
 from .edits import EDITS, NOTHING, Edit, apply_edit, possible
@@ -104,8 +105,7 @@ def _settings(folder: Path, settings: dict) -> None:
     """Keep what the shards are made of beside them. Raises DataError where other pairs are there already."""
     file = folder / "pairs.json"
     if not file.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(settings), encoding="utf-8")
+        write_text(file, json.dumps(settings))
     elif (there := json.loads(file.read_text(encoding="utf-8"))) | settings != there:
         raise DataError(f"{folder}: holds pairs made with {there}, asked for are {settings}. Choose another folder")
 
@@ -138,10 +138,8 @@ def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs
     for i in missing:
         stream = shard_pairs(seed, i, size, images, photographs)
         pairs = [pair for _, pair in zip(range(wanted[i]), stream, strict=False)]
-        part = files[i].with_suffix(".part")
-        with part.open("wb") as out:
-            np.savez(out, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
-        part.replace(files[i])
+        with replacing(files[i]) as part:
+            np.savez(part, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
 
 
 def read_pairs(folder: Path) -> dict[str, ndarray]:

@@ -7,6 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ..files import replacing
+
 
 class Curve:
     """Rows of numbers by column name, one row per report. `seconds` counts the run without the reports themselves."""
@@ -26,9 +28,8 @@ class Curve:
         return list(dict.fromkeys(name for row in self.rows for name in row))
 
     def write_csv(self, path: Path) -> None:
-        """Write the table; a value that a row lacks is left empty."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as file:
+        """Write the table; a value that a row lacks is left empty. Raises FileError."""
+        with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self.columns, restval="")
             writer.writeheader()
             writer.writerows(self.rows)

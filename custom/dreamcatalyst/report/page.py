@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from ..files import write_text
 from .chart import CHART_STYLE, COLOUR_STYLE
 from .pictures import to_uint8
 
@@ -100,9 +101,7 @@ class Page:
 
     def write(self, path: Path) -> Path:
         """Write the file."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(self.html(), encoding="utf-8")
-        return path
+        return write_text(path, self.html())
 
 
 def data_uri(image: Tensor, quality: int = 90) -> str:

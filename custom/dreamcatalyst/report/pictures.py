@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..files import replacing, write_bytes
+
 BAR = 18  # pixels above a picture, for its label
 
 
@@ -33,21 +35,24 @@ def picture_row(panels: Sequence[tuple[str, Tensor]]) -> np.ndarray:
 
 
 def write_png(path: Path, pixels: np.ndarray) -> Path:
-    """Write uint8 RGB."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels[..., ::-1])):
-        raise OSError(f"{path}: the picture could not be written")
-    return path
+    """Write uint8 RGB. Raises FileError."""
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))
+    return write_bytes(path, encoded.tobytes())
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> Path:
-    """Write uint8 RGB frames of one size as H.264 in yuv420p; odd sides lose their last row or column."""
+    """Write uint8 RGB frames of one size as H.264 in yuv420p; odd sides lose their last row or column.
+
+    Raises FileError.
+    """
     import imageio.v2 as imageio
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with imageio.get_writer(
-        path, fps=fps, codec="libx264", quality=8, macro_block_size=2, pixelformat="yuv420p"
-    ) as out:
-        for frame in frames:
-            out.append_data(np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]))
+    with replacing(path) as part:
+        with imageio.get_writer(
+            part, fps=fps, codec="libx264", quality=8, macro_block_size=2, pixelformat="yuv420p"
+        ) as out:
+            for frame in frames:
+                out.append_data(np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]))
+        with imageio.get_reader(part) as made:  # where the disk is full, the writer says nothing
+            made.get_data(0)
     return path

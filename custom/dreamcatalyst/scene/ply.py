@@ -7,7 +7,6 @@ written; any order, number type and byte order, and text, when read.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from ..data.origin import ZERO, Origin, far_origin
 from ..errors import SceneError
+from ..files import replacing
 from .gaussians import SH_C0, Gaussians
 from .plyfile import PlyTable, read_vertices, write_vertices
 
@@ -68,7 +68,8 @@ def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO) -> P
     Extras keep their number type (bool as uchar; int64 as uint or int where it fits; half types as float); an extra
     [N,k] becomes the k properties name_0 .. name_{k-1}. Normals are zero unless `extra` has nx, ny, nz.
     origin: as in `read_ply`; it is added to x, y, z, which are then written as doubles.
-    The file appears under its name only when it is complete. Raises SceneError where an extra cannot be written.
+    The file appears under its name only when it is complete. Raises SceneError where an extra cannot be written,
+    FileError where the file cannot.
     """
     path = Path(path)
     scene = scene.detach().to("cpu")
@@ -95,13 +96,8 @@ def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO) -> P
     if origin != ZERO:
         before = dict(zip(MEANS, (scene.means.double().numpy() + origin).T, strict=True))
         names, core = names[len(MEANS) :], core[:, len(MEANS) :]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with replacing(path) as part:
         write_vertices(part, names, core, extra, before)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
     return path
 
 

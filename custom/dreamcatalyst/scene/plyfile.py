@@ -106,7 +106,7 @@ def write_vertices(
         table[name] = column
     with path.open("wb") as file:
         file.write(header.encode())
-        table.tofile(file)
+        file.write(table.view(np.uint8).data)  # `tofile` would not say why it cannot
 
 
 def _header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:

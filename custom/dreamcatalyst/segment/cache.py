@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
-import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import plugin
+from .. import files, plugin
+from ..errors import FileError
 
 PLACES = ("data", "scene", "render", "diffusion", "guidance", "segment")  # whose code has a part in a mask
-BROKEN = (RuntimeError, ValueError, KeyError, TypeError, AttributeError, EOFError, OSError, pickle.UnpicklingError)
 
 
 def digest(*parts: Any) -> str:
@@ -63,28 +61,34 @@ def stamp(path: str | Path | None) -> Any:
 
 
 def save(folder: Path, key: str, weights: Tensor, images: Mapping[int, Tensor]) -> None:
-    """Keep weights [N] and pictures (number of a view to uint8 [H,W]). The file appears when it is complete."""
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f".{key}.{os.getpid()}.part"
-    try:
-        torch.save({"key": key, "weights": weights.cpu(), "images": dict(images)}, part)
-        part.replace(folder / f"{key}.pt")
-    finally:
-        part.unlink(missing_ok=True)
+    """Keep weights [N] and pictures (number of a view to uint8 [H,W]). Raises FileError."""
+    files.save(folder / f"{key}.pt", {"key": key, "weights": weights.cpu(), "images": dict(images)})
 
 
 def load(folder: Path, key: str) -> tuple[Tensor, dict[int, Tensor]] | None:
-    """What `save` kept under `key`; None where there is nothing. A file that is damaged or is not what its name says
-    is reported and left aside, to be written anew."""
+    """What `save` kept under `key`; None where there is nothing. A file that is not to the bit what was written, or not
+    what its name says, is reported and left aside, to be written anew."""
     path = folder / f"{key}.pt"
     if not path.is_file():
         return None
     try:
-        kept = torch.load(path, map_location="cpu", weights_only=True)
-        if kept["key"] != key:
-            raise ValueError(f"it holds the mask {kept['key']}")
-        return kept["weights"], kept["images"]
-    except BROKEN as error:
-        fault = f"{type(error).__name__}: {str(error).split('. ')[0]}"
-        plugin.warn(f"{path}: is no mask that can be used and is made again ({fault})")
+        kept, _ = files.load(path)
+        if not _is_mask(kept) or kept["key"] != key:
+            raise FileError(f"{path}: holds something else")
+    except FileError as error:
+        plugin.warn(f"{error}. The mask is made again")
         return None
+    return kept["weights"], kept["images"]
+
+
+def _is_mask(kept: Any) -> bool:
+    """Whether a file holds what `save` puts there."""
+    if not isinstance(kept, dict) or not {"key", "weights", "images"} <= set(kept):
+        return False
+    weights, images = kept["weights"], kept["images"]
+    pictures = isinstance(images, dict) and all(_is_of(image, torch.uint8, 2) for image in images.values())
+    return pictures and _is_of(weights, torch.float32, 1)
+
+
+def _is_of(value: Any, dtype: torch.dtype, ndim: int) -> bool:
+    return isinstance(value, Tensor) and value.dtype == dtype and value.ndim == ndim

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..cache import tensor_bytes
+from ..files import write_text
 from ..guidance.distill import network_rows
 from ..loss.perceptual import WEIGHT_BYTES
 from ..scene.gaussians import PARAMETERS, Gaussians
@@ -65,9 +66,7 @@ class Plan:
 
     def write(self, path: Path) -> Path:
         """As JSON."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({**asdict(self), "bytes": self.bytes}, indent=2) + "\n", encoding="utf-8")
-        return path
+        return write_text(path, json.dumps({**asdict(self), "bytes": self.bytes}, indent=2) + "\n")
 
 
 def readable(size: float) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import OmegaConf
 
+from ..files import write_text
 from ..report.chart import line_chart, picture_file
 from ..report.curve import Curve
 from ..report.machine import machine, versions
@@ -59,12 +60,11 @@ def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]])
     The summary's "overhead" says what reports took: rows, this function, and the share of both in the whole.
     """
     began, folder, record = time.perf_counter(), system.report_dir, system.record
-    folder.mkdir(parents=True, exist_ok=True)
     mean, seconds = mean_scores(list(scores.values())), record.clock.seconds
     if record.curve.rows:
         record.curve.write_csv(folder / "error.csv")
         plots = [chart for start, chart in charts(record.curve).items() if start in ("psnr_", "ssim_", "l1_")]
-        (folder / "error.svg").write_text(picture_file(plots), encoding="utf-8")
+        write_text(folder / "error.svg", picture_file(plots))
     summary = {
         "step": system.true_global_step,
         "seconds": round(seconds, 2),
@@ -80,7 +80,7 @@ def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]])
     rows, files = record.clock.reporting, time.perf_counter() - began
     share = (rows + files) / (seconds + rows + files)
     summary["overhead"] = {"rows": round(rows, 3), "files": round(files, 3), "share": round(share, 4)}
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     return [folder]
 
 

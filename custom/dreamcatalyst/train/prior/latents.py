@@ -8,6 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from ... import files, plugin
+from ...errors import FileError
 from ..progress import Meter
 from .data import Pairs
 
@@ -39,13 +41,15 @@ def cached_latents(file: Path, vae: nn.Module, pairs: Pairs, device: torch.devic
     """`encode_pairs`, or what it gave before for the same weights and the same pairs, from `file`."""
     key = _key(vae, pairs)
     if file.exists():
-        kept = torch.load(file, weights_only=True)
-        if kept["key"] == key:
-            return kept
+        try:
+            kept, _ = files.load(file)
+        except FileError as error:
+            plugin.warn(f"{error}; the latents are made again")
+        else:
+            if kept["key"] == key:
+                return kept
     made = {"key": key, **encode_pairs(vae, pairs, device)}
-    part = file.with_suffix(".part")
-    torch.save(made, part)
-    part.replace(file)
+    files.save(file, made)
     return made
 
 
