@@ -102,7 +102,7 @@ def big(folder: Path, n: int) -> None:
         "a.png": lambda path: write_png(path, pixels),
         "a.csv": lambda path: Curve([{"step": i, "x": i / 3} for i in range(100 * n * n)]).write_csv(path),
         "a.html": lambda path: files.write_text(path, "x" * 3000 * n * n),
-        "a.mp4": lambda path: write_video(path, [pixels] * n),
+        "a.mp4": lambda path: write_video(path, (pixels ^ np.uint8(37 * i % 256) for i in range(n))),
     }
     for name, write in writers.items():
         if n == 1:
