@@ -10,9 +10,7 @@ import importlib
 import inspect
 import logging
 import os
-import pickle
 import shlex
-import shutil
 import sys
 import traceback
 import warnings
@@ -23,7 +21,8 @@ ROOT = Path(__file__).resolve().parent
 # Threads that wait soon sleep instead of spinning on (GNU OpenMP spins six times as long), unless the user says
 # otherwise: where something else wants the cores, spinning takes them from the very thread that is waited for.
 os.environ.setdefault("GOMP_SPINCOUNT", "50000")
-INTERRUPTED = 130  # the exit status of a shell command that Ctrl-C ended
+MINUTES = 3  # of training between two checkpoints, where checkpoint.minutes says nothing else
+SINGLE = ("auto", "single_device")  # strategies of one process
 
 
 def arguments(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -64,22 +63,30 @@ def entry() -> Path:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run; the exit status is 0, 2 for an error of the user's, 130 after Ctrl-C. Other errors keep their traceback."""
+    """Run; the exit status is 0, 2 for an error of the user's, 128 + n after signal n (Ctrl-C is 2, SIGTERM 15, SIGHUP
+    1). Other errors keep their traceback."""
     args, overrides = arguments(sys.argv[1:] if argv is None else argv)
     sys.path.insert(0, str(entry().parent))
     importlib.import_module(entry().name)
     from dreamcatalyst.errors import DreamCatalystError
+    from dreamcatalyst.signals import Stop, Stopped, lasting_streams
 
-    try:
-        return link_into(args.link) if args.link else run(args, overrides)
-    except DreamCatalystError as error:
-        if args.verbose:
-            traceback.print_exc()
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+    with lasting_streams(), Stop().installed() as stop:
+        try:
+            return link_into(args.link) if args.link else run(args, overrides, stop)
+        except Stopped as stopped:
+            print(f"stopped by {stopped}", file=sys.stderr)
+            return stop.status
+        except (DreamCatalystError, OSError) as error:
+            message = str(error)
+            if isinstance(error, OSError):
+                if error.errno is None:  # not the file system's
+                    raise
+                message = f"{error.filename or 'a file cannot be read or written'}: {error.strerror}"
+            if args.verbose:
+                traceback.print_exc()
+            print(f"error: {message}", file=sys.stderr)
+            return 2
 
 
 def link_into(host: Path) -> int:
@@ -92,92 +99,126 @@ def link_into(host: Path) -> int:
     return 0
 
 
-def run(args: argparse.Namespace, overrides: list[str]) -> int:
-    """Load the config, build data and system, and hand them to Lightning."""
-    from dreamcatalyst.config import load_config
-    from dreamcatalyst.errors import ConfigError
+def run(args: argparse.Namespace, overrides: list[str], stop: Any) -> int:
+    """Load the config, build data and system, and hand them to Lightning. stop: the Stop that takes the signals."""
+    from dreamcatalyst.config import merge_config, read_config
 
     if args.gpu is not None:
         os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(args.gpu))  # read by torch, which is not imported yet
-    config = load_config(args.config, cli_args=overrides)
+    merged = merge_config(args.config, cli_args=overrides)
+    config = read_config(merged)
     mode = args.mode or "train"
 
-    from dreamcatalyst.train.interrupt import SaveOnInterrupt
+    from dreamcatalyst.runs import claimed, told
+    from dreamcatalyst.signals import Stopped
+
+    numbered = config.use_timestamp and merged.get("timestamp") is None
+    with claimed(config, numbered=numbered, writes=mode in ("train", "test")) as config:
+        folder = Path(config.trial_dir)
+        try:
+            carry_out(args, config, merged, mode, stop)
+        except Stopped as stopped:
+            print(f"stopped by {stopped}; {told(folder)}", file=sys.stderr)
+            return stop.status
+    return 0
+
+
+def carry_out(args: argparse.Namespace, config: Any, merged: Any, mode: str, stop: Any) -> None:
+    """Do in the run's folder, which is there, what `mode` says."""
+    from dreamcatalyst.errors import ConfigError
+    from dreamcatalyst.resume import compare, contents, read_checkpoint, recipe
+    from dreamcatalyst.runs import told
+    from dreamcatalyst.train.keeper import Checkpoints, Keeper
     from dreamcatalyst.train.progress import AboveTheLine, Progress
     from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
     if not args.verbose:
         quiet()
-    progress, interrupt = Progress(), SaveOnInterrupt()
+    progress = Progress()
     log = logging.getLogger("dreamcatalyst")
     log.handlers = [AboveTheLine(progress)]
     log.setLevel(logging.DEBUG if args.verbose else logging.INFO)
 
-    clock = checkpoint_clock(config.resume)
-    trainer = make_trainer(config, [progress, interrupt], training=mode == "train")
-    data, system = build(config)
+    minutes, training = checkpoint_minutes(config), mode == "train"
+    parts = classes(config)
+    made_by = recipe(config, parts)
+    saved = read_checkpoint(config.resume, to_train=training) if config.resume else None
+    if saved and training:
+        compare(saved, made_by, config.resume)
+    checkpoints = Checkpoints({"recipe": made_by, "contents": contents(made_by) if training else {}})
+    keeper = Keeper(stop, checkpoints, Path(config.trial_dir) / "ckpts", minutes)
+    trainer = make_trainer(config, [progress, keeper], checkpoints, training)
+    data, system = build(config, parts)
     log.info(f"{mode}: {config.trial_dir}")
     try:
-        if mode == "train":
-            snapshot(config, args.config)
+        if training:
+            snapshot(config, merged, args.config)
             if not trainer.fast_dev_run:
                 trainer.loggers = [*trainer.loggers, *system.get_loggers()]
             trainer.fit(system, datamodule=data, ckpt_path=config.resume)
-            if not interrupt.interrupted:
-                trainer.test(system, datamodule=data, verbose=args.verbose)
+            if keeper.began is None or trainer.global_step <= keeper.began:
+                raise ConfigError("trainer: no step was taken: an option ended the run before (max_epochs, max_time?).")
+            trainer.test(system, datamodule=data, verbose=args.verbose)
         elif mode == "preview":
             preview(system, data, trainer)
         else:
-            if clock:
-                system.set_resume_status(*clock)
+            if saved:
+                system.set_resume_status(saved["epoch"], saved["global_step"])
             stage = {"validate": trainer.validate, "test": trainer.test, "export": trainer.predict}[mode]
             table = {} if mode == "export" else {"verbose": args.verbose}  # Lightning's own table of scores
             stage(system, datamodule=data, ckpt_path=config.resume, **table)
     except MisconfigurationException as error:  # an option that this system's kind of training cannot have
         raise ConfigError(f"trainer: {error}") from error
     except Exception:
-        if interrupt.left:
-            log.info("stopped by an error" + left_behind(interrupt.left))
+        if keeper.began is not None:
+            log.info(f"stopped by an error; {told(Path(config.trial_dir))}")
         raise
-    except SystemExit:  # after Ctrl-C some versions of Lightning exit and some return; the callbacks have saved
-        if not interrupt.interrupted:
-            raise
-    if interrupt.interrupted:
-        log.info("interrupted" + left_behind(interrupt.left))
-        return INTERRUPTED
-    return 0
 
 
-def left_behind(paths: list[Path]) -> str:
-    """What an unfinished run left, for the end of a message."""
-    return ("; left behind:" + "".join(f"\n  {path}" for path in paths)) if paths else ""
-
-
-def build(config: Any) -> tuple[Any, Any]:
-    """The data module and the system, by their registered names; both sections are validated before either is built."""
+def classes(config: Any) -> dict[str, type]:
+    """The classes of data module and system, by their registered names; both sections are validated."""
     from dreamcatalyst import plugin
     from dreamcatalyst.config import check
     from dreamcatalyst.errors import ConfigError, choose
 
-    classes = []
+    found = {}
     for key, base in (("data", plugin.pl.LightningDataModule), ("system", plugin.BaseSystem)):
         name = choose(key, getattr(config, f"{key}_type"), plugin.names(), f"{key}_type")
-        classes.append(plugin.find(name))
-        if not issubclass(classes[-1], base):
+        found[key] = plugin.find(name)
+        if not issubclass(found[key], base):
             raise ConfigError(f"{key}_type: '{name}' is registered, but is no {base.__name__}.")
-        check(classes[-1], getattr(config, key), key)
+        check(found[key], getattr(config, key), key)
+    return found
+
+
+def build(config: Any, parts: dict[str, type]) -> tuple[Any, Any]:
+    """The data module and the system. parts: their classes."""
+    from dreamcatalyst import plugin
+    from dreamcatalyst.errors import ConfigError
+
     try:
         plugin.pl.seed_everything(config.seed, workers=True)
     except ValueError as error:
         raise ConfigError(f"seed: {error}.") from error
-    data = classes[0](config.data)
-    system = classes[1](config.system, resumed=config.resume is not None)
+    data = parts["data"](config.data)
+    system = parts["system"](config.system, resumed=config.resume is not None)
     system.set_save_dir(str(Path(config.trial_dir) / "save"))
     return data, system
 
 
-def make_trainer(config: Any, callbacks: list[Any], training: bool) -> Any:
-    """Lightning's Trainer, on one GPU where there is one and else on the CPU; `trainer` in the YAML overrides."""
+def checkpoint_minutes(config: Any) -> float:
+    """Minutes of training between two checkpoints, 0 for none but those at the steps that the config names."""
+    from dreamcatalyst.errors import ConfigError
+
+    minutes = config.checkpoint.get("minutes", MINUTES)
+    if isinstance(minutes, bool) or not isinstance(minutes, (int, float)) or not 0 <= minutes < float("inf"):
+        raise ConfigError(f"checkpoint.minutes: got {minutes!r}, expected minutes between two checkpoints; 0: none.")
+    return minutes
+
+
+def make_trainer(config: Any, callbacks: list[Any], checkpoints: Any, training: bool) -> Any:
+    """Lightning's Trainer, on one GPU where there is one and else on the CPU; `trainer` in the YAML overrides.
+    checkpoints: the CheckpointIO."""
     from dreamcatalyst.errors import ConfigError
     from lightning.pytorch import Trainer
     from lightning.pytorch.accelerators import CUDAAccelerator
@@ -199,12 +240,15 @@ def make_trainer(config: Any, callbacks: list[Any], training: bool) -> Any:
         callbacks = callbacks[1:]
     if training and options["logger"] is True:
         options["logger"] = CSVLogger(config.trial_dir, name="csv_logs")
-    steps = options.get("max_steps", 1)
-    if not isinstance(steps, int) or steps < 1:
-        raise ConfigError(f"trainer.max_steps: got {steps}, expected 1 or more: schedules go over the run's length.")
+    options["plugins"] = [*(options.get("plugins") or []), checkpoints]
+    if options.get("strategy", "auto") not in SINGLE:
+        raise ConfigError(f"trainer.strategy: got '{options['strategy']}', expected auto: a run is one process.")
+    for name, whole in {"limit_train_batches": (None, 1.0), "overfit_batches": (None, 0)}.items() if training else ():
+        if options.get(name) not in whole or isinstance(options.get(name), bool):
+            raise ConfigError(f"trainer.{name}: leave it out: what ends a run is trainer.max_steps alone.")
     try:
         if training and options["enable_checkpointing"]:
-            checkpoint = known_options(ModelCheckpoint, config.checkpoint, "checkpoint")
+            checkpoint = known_options(ModelCheckpoint, config.checkpoint, "checkpoint", {"minutes"})
             # Without a counter, last.ckpt is the last one in a resumed run too.
             ours = {"dirpath": Path(config.trial_dir) / "ckpts", "enable_version_counter": False}
             callbacks = [*callbacks, ModelCheckpoint(**ours | checkpoint)]
@@ -216,35 +260,17 @@ def make_trainer(config: Any, callbacks: list[Any], training: bool) -> Any:
     return trainer
 
 
-def known_options(cls: type, section: Any, where: str) -> dict[str, Any]:
-    """A section of the YAML as keyword arguments for `cls`. Raises ConfigError for one that it does not take."""
+def known_options(cls: type, section: Any, where: str, ours: set[str] = frozenset()) -> dict[str, Any]:
+    """A section of the YAML as keyword arguments for `cls`, without keys that are `ours`. Raises ConfigError for one
+    that it does not take."""
     from dreamcatalyst.errors import ConfigError, unknown
     from omegaconf import OmegaConf
 
     known = [name for name in inspect.signature(cls).parameters if name not in ("callbacks", "kwargs")]
     for key in section:
-        if key not in known:
-            raise ConfigError(unknown("key", key, known, where))
-    return OmegaConf.to_container(OmegaConf.create(section))
-
-
-def checkpoint_clock(path: str | None) -> tuple[int, int] | None:
-    """Epoch and step of a checkpoint, at which its validation, test and export count as taking place.
-
-    Raises ConfigError for a file that is no checkpoint, before anything else is done.
-    """
-    if path is None:
-        return None
-    import torch
-    from dreamcatalyst.errors import ConfigError
-
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ConfigError(f"resume: '{path}' is no checkpoint of a run, or a damaged one.") from error
-    if not isinstance(saved, dict) or not {"epoch", "global_step", "pytorch-lightning_version"} <= set(saved):
-        raise ConfigError(f"resume: '{path}' is no checkpoint of a run: it does not say epoch and step.")
-    return saved["epoch"], saved["global_step"]
+        if key not in known and key not in ours:
+            raise ConfigError(unknown("key", key, {*known, *ours}, where))
+    return {key: value for key, value in OmegaConf.to_container(OmegaConf.create(section)).items() if key not in ours}
 
 
 def preview(system: Any, data: Any, trainer: Any) -> None:
@@ -257,18 +283,18 @@ def preview(system: Any, data: Any, trainer: Any) -> None:
         print(path)
 
 
-def snapshot(config: Any, source: str) -> None:
-    """Leave in the trial's folder what made it: the config as parsed and as written, and the command."""
+def snapshot(config: Any, merged: Any, source: str) -> None:
+    """Leave in the trial's folder what made it: the config as parsed and as written, and the commands."""
     from dreamcatalyst.config import save_config
+    from dreamcatalyst.files import write_bytes, write_text
 
-    folder = Path(config.trial_dir) / "configs"
-    folder.mkdir(parents=True, exist_ok=True)
-    raw = folder / "raw.yaml"
+    folder = Path(config.trial_dir)
+    raw, commands = folder / "configs" / "raw.yaml", folder / "cmd.txt"
     if not raw.exists() or not raw.samefile(source):
-        shutil.copyfile(source, raw)
-    save_config(config, folder / "parsed.yaml")
-    command = shlex.join(["python", *sys.argv])
-    (Path(config.trial_dir) / "cmd.txt").write_text(f"{command}\n", encoding="utf-8")
+        write_bytes(raw, Path(source).read_bytes())
+    save_config(config, folder / "configs" / "parsed.yaml", merged)
+    before = commands.read_text(encoding="utf-8") if commands.exists() else ""
+    write_text(commands, f"{before}{shlex.join(['python', *sys.argv])}\n")
 
 
 def quiet() -> None:

@@ -15,7 +15,9 @@ from dreamcatalyst.config import (
     corners,
     largest,
     load_config,
+    merge_config,
     parse,
+    read_config,
     save_config,
     value,
 )
@@ -263,6 +265,11 @@ def test_other_arguments_are_read_as_yaml(written):
         ("a: [1", [], ": not valid YAML: "),
         ("a: 1\na: 2", [], "run.yaml:2:1: not valid YAML: found duplicate key"),
         ("- a", [], "run.yaml: got a list"),
+        ("system: 5", [], "system: got 5 (int), expected dict"),
+        ("trainer: {max_steps: abc, x: '${add:${trainer.max_steps},1}'}", [], "trainer.max_steps: got 'abc'"),
+        ("trainer: {max_steps: true}", [], "trainer.max_steps: got True (bool), expected a whole number"),
+        ("trainer: {max_steps: 1.5}", [], "trainer.max_steps: got 1.5 (float), expected a whole number"),
+        ("trainer: {max_steps: 0}", [], "trainer.max_steps: got 0 (int), expected a whole number, 1 or more"),
         ("use_timestamp: false", [], "tag: empty, and use_timestamp is false"),
         ("name: x", ["sunset"], "'sunset' on the command line is neither a flag nor key=value"),
         ("name: x", ["system.a=[1"], "system.a: '[1' is not a valid list or mapping"),
@@ -273,6 +280,32 @@ def test_a_run_that_cannot_be_is_refused(written, text, arguments, said):
     with pytest.raises(ConfigError) as error:
         load_config(written(text), cli_args=arguments)
     assert said in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["../..", "/", "/etc", "..", "a/b", "\\", "x\0y", "long " * 100, "ü" * 200, " . "])
+@pytest.mark.parametrize("key", ["tag", "name", "timestamp"])
+def test_no_text_leads_a_run_out_of_its_folder(written, tmp_path, key, text):
+    config = load_config(written("name: n\ntag: t"), exp_root_dir=str(tmp_path), **{key: text})
+    trial = Path(config.trial_dir)
+    assert trial.parent.parent == tmp_path and trial.resolve() == trial
+    assert max(len(part.encode()) for part in trial.parts) < 250
+    trial.mkdir(parents=True)
+
+
+def test_long_prompts_that_differ_at_their_end_have_folders_of_their_own(written):
+    tags = [f"tag={'Make_it_so_' * 30}{end}" for end in "ab"]
+    one, other = (load_config(written("timestamp: now"), cli_args=[tag]).trial_dir for tag in tags)
+    assert one != other
+
+
+def test_what_follows_from_the_length_follows_it_in_the_saved_config_too(written, tmp_path):
+    text = "tag: a\ntrainer: {max_steps: 4, val_check_interval: '${add:${trainer.max_steps},1}'}"
+    merged = merge_config(written(text))
+    config = read_config(merged)
+    save_config(config, tmp_path / "parsed.yaml", merged)
+    assert load_config(tmp_path / "parsed.yaml") == config
+    longer = load_config(tmp_path / "parsed.yaml", cli_args=["trainer.max_steps=9"])
+    assert longer.trainer["val_check_interval"] == 10
 
 
 def test_a_missing_file_is_named_with_its_nearest_neighbour(written, tmp_path, monkeypatch):
@@ -310,8 +343,8 @@ def test_the_experiment_has_the_hosts_fields():
 
 
 def test_what_cannot_be_worked_out_names_its_expression(written):
-    path = written("trainer:\n  max_steps: two\n  val_check_interval: ${add:${trainer.max_steps},1}\n")
-    with pytest.raises(ConfigError, match=r"trainer\.val_check_interval: .*\$\{trainer\.max_steps\}"):
+    path = written("trainer:\n  max_epochs: two\n  min_epochs: ${add:${trainer.max_epochs},1}\n")
+    with pytest.raises(ConfigError, match=r"trainer\.min_epochs: .*\$\{trainer\.max_epochs\}"):
         load_config(path)
 
 

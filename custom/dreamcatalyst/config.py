@@ -21,11 +21,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from .errors import ConfigError, choose, nearest, unknown
+from .files import folder_name, write_text
 
 Scalar = Annotated[float, "schedule"]
 """A number, or a schedule of it: [v0, v1, end], [start, v0, v1, end] or [start, v0, v1, s1, v2, s2, ...]; see `value`.
 OmegaConf, and so the host's parser, takes the annotation for `float`."""
 
+TIMESTAMP = "@%Y%m%d-%H%M%S"  # of a run's start, in its folder's name
 _SCHEDULE = "[v0, v1, end], [start, v0, v1, end] or [start, v0, v1, s1, v2, s2, ...]"
 
 
@@ -218,7 +220,7 @@ class ExperimentConfig:
     tag: str = ""  # the trial's folder is tag + timestamp
     seed: int = 0
     use_timestamp: bool = True
-    timestamp: str | None = None  # null: the time of the start, @%Y%m%d-%H%M%S
+    timestamp: str | None = None  # null: the time of the start, as TIMESTAMP
     exp_root_dir: str = "outputs"
     exp_dir: str = ""
     trial_name: str = ""
@@ -233,21 +235,51 @@ class ExperimentConfig:
     checkpoint: dict = field(default_factory=dict)  # any option of lightning's ModelCheckpoint
 
 
-def load_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: Any) -> ExperimentConfig:
-    """Merge YAML files from left to right, then `key.sub=value` arguments, then `overrides`; resolve and parse.
-
-    A run that resumes from `<trial>/ckpts/x.ckpt` gets that trial's folder. Raises ConfigError.
-    """
+def merge_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: Any) -> DictConfig:
+    """YAML files merged from left to right, then `key.sub=value` arguments, then `overrides`; nothing is resolved, so
+    that what follows from another key still does. Raises ConfigError."""
     _register_resolvers()
     merged = OmegaConf.merge(*[_read(Path(path)) for path in yamls], _dotlist(cli_args), overrides)
     for key in missing_keys(OmegaConf.to_container(merged)):
         raise ConfigError(f"{key}: a value is needed, and none is given. Add {key}=... to the command.")
+    return merged
+
+
+def read_config(merged: DictConfig) -> ExperimentConfig:
+    """The run that `merge_config` describes: resolved, parsed, with the names of its folders. Raises ConfigError.
+
+    A run that resumes from `<trial>/ckpts/x.ckpt` gets that trial's folder.
+    """
+    resolved = merged.copy()
+    _check_first(resolved)
     try:
-        OmegaConf.resolve(merged)
+        OmegaConf.resolve(resolved)
     except OmegaConfBaseException as error:
         reason = f"{str(error).splitlines()[0]}, in {error.child_node}"
         raise ConfigError(f"{getattr(error, 'full_key', None) or 'config'}: {reason}") from error
-    return _with_folders(parse(ExperimentConfig, merged))
+    return _with_folders(parse(ExperimentConfig, resolved))
+
+
+def load_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: Any) -> ExperimentConfig:
+    """`read_config` of `merge_config`."""
+    return read_config(merge_config(*yamls, cli_args=cli_args, **overrides))
+
+
+def _check_first(merged: DictConfig) -> None:
+    """Raise ConfigError for what other keys are worked out from, so that none of these is blamed."""
+    for key in ("data", "system", "trainer", "checkpoint"):
+        section = OmegaConf.select(merged, key)
+        if key in merged and section is not None and not isinstance(section, DictConfig):
+            raise ConfigError(f"{key}: got {_show(section)}, expected dict ({key}.<key>=<value>).")
+    try:
+        steps = OmegaConf.select(merged, "trainer.max_steps")
+    except OmegaConfBaseException:
+        return  # worked out itself from what cannot be: the resolver names that place
+    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 1):
+        raise ConfigError(
+            f"trainer.max_steps: got {_show(steps)}, expected a whole number, 1 or more: schedules go over the run's "
+            "length."
+        )
 
 
 def missing_keys(node: Any, where: str = "") -> Iterator[str]:
@@ -258,31 +290,40 @@ def missing_keys(node: Any, where: str = "") -> Iterator[str]:
         yield from missing_keys(below, f"{where}.{key}" if where else str(key))
 
 
-def save_config(config: ExperimentConfig, path: Path) -> None:
-    """Write a config as YAML that `load_config` takes to the same trial."""
-    OmegaConf.save(OmegaConf.create({f.name: getattr(config, f.name) for f in dataclasses.fields(config)}), path)
+def save_config(config: ExperimentConfig, path: Path, merged: DictConfig | None = None) -> None:
+    """Write a config as YAML that `load_config` takes to the same trial. merged: what `config` was read from: what
+    follows from other keys there is written so, and follows them again where the file is loaded with another length."""
+    told = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    if merged is not None:
+        told |= {key: value for key, value in OmegaConf.to_container(merged).items() if key not in _FOUND}
+    write_text(path, OmegaConf.to_yaml(OmegaConf.create(told)))
+
+
+_FOUND = ("timestamp", "exp_dir", "trial_name", "trial_dir")  # what is no one's to give, but is kept in the YAML
 
 
 def _with_folders(config: ExperimentConfig) -> ExperimentConfig:
-    exp_dir, timestamp = Path(config.exp_root_dir) / config.name, config.timestamp
     if config.resume and not Path(config.resume).is_file():
         near = nearest(Path(config.resume).name, [p.name for p in Path(config.resume).parent.glob("*.ckpt")])
         raise ConfigError(f"resume: there is no checkpoint '{config.resume}'.{near}")
-    trial = Path(config.resume).parent.parent if config.resume else None
-    if timestamp is None and trial and (trial / "configs" / "parsed.yaml").is_file():
-        if trial.name.startswith(config.tag):
-            timestamp = trial.name[len(config.tag) :]
-        else:
-            config, timestamp = dataclasses.replace(config, tag=trial.name), ""
-        exp_dir = trial.parent
-    elif timestamp is None:
-        timestamp = time.strftime("@%Y%m%d-%H%M%S") if config.use_timestamp and config.n_gpus == 1 else ""
-    trial_name = config.tag + timestamp
+    checkpoint = Path(config.resume or "")
+    trial = (checkpoint if len(checkpoint.parts) > 2 else checkpoint.absolute()).parent.parent
+    if config.resume and (trial / "configs" / "parsed.yaml").is_file():
+        tag = folder_name(config.tag)
+        return _in_folder(config, trial, trial.name[len(tag) :] if trial.name.startswith(tag) else "")
+    timestamp = config.timestamp
+    if timestamp is None:
+        timestamp = time.strftime(TIMESTAMP) if config.use_timestamp and config.n_gpus == 1 else ""
+    # Texts of the user's, which may hold anything: none of them leads out of the folder before it.
+    trial_name = folder_name(config.tag) + folder_name(timestamp)
     if not trial_name:
         raise ConfigError("tag: empty, and use_timestamp is false: the trial's folder has no name. Set one of them.")
-    return dataclasses.replace(
-        config, timestamp=timestamp, exp_dir=str(exp_dir), trial_name=trial_name, trial_dir=str(exp_dir / trial_name)
-    )
+    return _in_folder(config, Path(config.exp_root_dir) / folder_name(config.name) / trial_name, timestamp)
+
+
+def _in_folder(config: ExperimentConfig, trial: Path, timestamp: str) -> ExperimentConfig:
+    names = dict(exp_dir=str(trial.parent), trial_name=trial.name, trial_dir=str(trial))
+    return dataclasses.replace(config, timestamp=timestamp, **names)
 
 
 def _read(path: Path) -> DictConfig:

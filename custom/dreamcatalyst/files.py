@@ -7,7 +7,7 @@ import hashlib
 import os
 import unicodedata
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -24,14 +24,15 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, suffix: str = "") -> Iterator[Path]:
     """The path of a part file beside `path`, for the block to write; then it takes the place of `path` at once.
 
     Until then an earlier file of the name stays as it was, also where the process or the machine dies. Folders are
-    made as needed. Raises FileError for what the file system refuses, or where the block wrote nothing.
+    made as needed. suffix: of the part file, for writers that go by a name's end.
+    Raises FileError for what the file system refuses, or where the block wrote nothing.
     """
     path = Path(path)
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part{suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -56,6 +57,18 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
 def write_text(path: str | Path, text: str) -> Path:
     """Write a whole file as UTF-8; returns its path. Raises FileError."""
     return write_bytes(path, text.encode())
+
+
+def try_each(writers: Iterable[Callable[[], Any]]) -> None:
+    """Call all of `writers`, whatever becomes of the others; then raise the first FileError, if there was one."""
+    errors = []
+    for write in writers:
+        try:
+            write()
+        except FileError as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
 
 
 def unwritable(path: str | Path, error: OSError) -> FileError:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from .config import value
 from .errors import ConfigError
+from .files import try_each
 
 logger = logging.getLogger("dreamcatalyst")
 info, warn = logger.info, logger.warning
@@ -139,11 +141,18 @@ class BaseSystem(LightningModule):
         """What the progress line shows of the last step, such as {"loss": 0.1, "splats": 20000}."""
         return {}
 
-    def save_now(self) -> list[Path]:
-        """Write what an interrupted run should leave, and return where: here a checkpoint to resume from."""
+    def keep_result(self) -> None:
+        """Write, after the last step, what would be missed most; the checkpoint comes after it."""
+
+    def savers(self) -> list[Callable[[], Any]]:
+        """What writes the state of the moment, what would be missed most first: here a checkpoint to resume from."""
         checkpoint = Path(self.get_save_dir()).parent / "ckpts" / "last.ckpt"
-        self.trainer.save_checkpoint(checkpoint)
-        return [checkpoint]
+        return [lambda: self.trainer.save_checkpoint(checkpoint)]
+
+    def save_now(self) -> None:
+        """Write what an interrupted run should leave. Raises FileError where a part of it cannot be written; all others
+        have been tried then."""
+        try_each(self.savers())
 
     # --- updates: before every batch of whatever stage, and after every training batch
 

@@ -138,8 +138,8 @@ def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs
     for i in missing:
         stream = shard_pairs(seed, i, size, images, photographs)
         pairs = [pair for _, pair in zip(range(wanted[i]), stream, strict=False)]
-        with replacing(files[i]) as part:
-            np.savez(part, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
+        with replacing(files[i]) as part, part.open("wb") as out:
+            np.savez(out, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
 
 
 def read_pairs(folder: Path) -> dict[str, ndarray]:

@@ -47,7 +47,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> Path
     """
     import imageio.v2 as imageio
 
-    with replacing(path) as part:
+    with replacing(path, path.suffix) as part:
         with imageio.get_writer(
             part, fps=fps, codec="libx264", quality=8, macro_block_size=2, pixelformat="yuv420p"
         ) as out:

@@ -77,7 +77,7 @@ def write_all(system: SplatSystem, scores: Mapping[int, Mapping[str, float]]) ->
     """Write splats, report, comparisons and video, in the order of what would be missed most; print the scores and
     where things are."""
     step, capture = system.true_global_step, system.capture
-    written = [system.write_splats("last.ply")]
+    written = [system.keep_tested()]
     more = last_scores(system, list(scores)[: system.part["report"].views])
     scores = {index: {**score, **more.get(index, {})} for index, score in scores.items()}
     written += write_report(system, scores)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,7 @@ class SplatSystem(System):
         self.judge: ClipJudge | None = None
         self._outcomes: dict[int, dict[str, float]] = {}
         self._cap_announced = False
+        self._kept_at: int | None = None  # the step whose splats are in last.ply, of those that this process trained
 
     def setup(self, stage: str) -> None:
         if self.splats is None:
@@ -285,7 +287,7 @@ class SplatSystem(System):
         if self.true_global_step < self.max_steps:  # ended by something else, such as trainer.max_time
             self.save_now()
         else:
-            self.write_splats("last.ply")  # before any test can fail
+            self.keep_result()  # before any test can fail
 
     @property
     def title(self) -> str:
@@ -358,11 +360,23 @@ class SplatSystem(System):
         write_ply(path, self.splats.scene.detach().to("cpu"), origin=self.origin)
         return path
 
-    def save_now(self) -> list[Path]:
-        """Keep the state of the moment (after an interruption): a checkpoint to resume from, and the PLY."""
-        checkpoint = Path(self.get_save_dir()).parent / "ckpts" / "last.ckpt"
-        self.trainer.save_checkpoint(checkpoint)
-        return [checkpoint, self.write_splats("last.ply"), *summary.write_report(self, {})]
+    def keep_result(self) -> None:
+        if self._kept_at != self.true_global_step or not self.save_path("last.ply").is_file():
+            self.write_splats("last.ply")
+            self._kept_at = self.true_global_step
+
+    def keep_tested(self) -> Path:
+        """Write the splats that were scored: the run's result, unless there is one already and a checkpoint, perhaps an
+        earlier one, was only looked at again."""
+        result = self.save_path("last.ply")
+        if self._kept_at is None and result.is_file():
+            return self.write_splats(f"it{self.true_global_step}-test/point_cloud.ply")
+        self.keep_result()
+        return result
+
+    def savers(self) -> list[Callable[[], Any]]:
+        splats, report = partial(self.write_splats, "last.ply"), partial(summary.write_report, self, {})
+        return [splats, *super().savers(), report]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["splats"] = self.splats.state_dict()
