@@ -21,13 +21,16 @@ import yaml
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "custom"))
 
+from dreamcatalyst.config import load_config  # noqa: E402
 from dreamcatalyst.demo.capture import PREFIX  # noqa: E402
 from dreamcatalyst.errors import DreamCatalystError  # noqa: E402
+from dreamcatalyst.files import load  # noqa: E402
 from dreamcatalyst.report.evaluation import PAPER_PAIRS, Pair, read_pairs, table  # noqa: E402
 
 
 def launch(trial: Path, config: Path, given: list[str]) -> None:
-    """Run the launcher into `trial`, from its last checkpoint where there is one. What it says goes to a file there."""
+    """Run the launcher into `trial`, from its last checkpoint where there is one: to its end, or where it has been
+    there, to its scores. What it says goes to a file there."""
     trial.mkdir(parents=True, exist_ok=True)
     where = [
         f"exp_root_dir={trial.parents[1]}",
@@ -37,6 +40,8 @@ def launch(trial: Path, config: Path, given: list[str]) -> None:
     ]
     checkpoint = trial / "ckpts" / "last.ckpt"
     resume = [f"resume={checkpoint}"] if checkpoint.is_file() else []
+    if resume and load(checkpoint)[0]["global_step"] >= load_config(config, cli_args=given).trainer["max_steps"]:
+        resume.append("--test")
     command = [sys.executable, str(ROOT / "launch.py"), "--config", str(config), *where, *given, *resume]
     with (trial / "evaluate.log").open("w", encoding="utf-8") as log:
         subprocess.run(command, stdout=log, stderr=subprocess.STDOUT)

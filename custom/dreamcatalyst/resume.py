@@ -161,6 +161,8 @@ def compare(saved: Mapping[str, Any], told: Mapping[str, Any], path: str | Path)
             changed.append(f"{key} was {_show(old)} and is now {_show(new)}")
         elif key in had and key in has and not same_files:
             changed.append(f"the content of {key} ({told[key]}) is another one")
+    if was.get("system_type") != told["system_type"]:  # then all else differs, too
+        changed = [c for c in changed if c.startswith("system_type ")]
     if changed:
         more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
         ply = Path(path).parent.parent / "save" / "last.ply"

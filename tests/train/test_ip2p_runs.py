@@ -97,5 +97,5 @@ def test_a_checkpoint_of_a_fit_is_no_edit_to_go_on_from(launch, capsys):
     fit = launch("fit.yaml", "trainer.max_steps=1", name="fit")
     launch("closed-form.yaml", "trainer.max_steps=2", f"resume={fit / 'ckpts' / 'last.ckpt'}", status=2)
     error = capsys.readouterr().err
-    assert "resume: the checkpoint is of a run without guidance" in error and "system.gs_source" in error
+    assert "system_type was 'dreamcatalyst-fit-system'" in error and "system.gs_source" in error
     assert "Traceback" not in error

@@ -199,6 +199,10 @@ def test_a_run_that_time_ends_leaves_a_checkpoint(launch):
 def test_a_checkpoint_of_another_system_is_refused(launch, capsys):
     trial = launch("closed-form.yaml", "trainer.max_steps=1")
     launch("fit.yaml", f"resume={trial / 'ckpts' / 'last.ckpt'}", "trainer.max_steps=2", status=2)
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "system_type was 'dreamcatalyst-edit-system' and is now 'dreamcatalyst-fit-system'" in told
+    assert f"system.gs_source={trial / 'save' / 'last.ply'}" in told and ";" not in told
+    launch("fit.yaml", f"resume={trial / 'ckpts' / 'last.ckpt'}", mode="--test", status=2)
     assert "EditSystem" in capsys.readouterr().err
 
 
