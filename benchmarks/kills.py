@@ -40,9 +40,10 @@ def processes() -> multiprocessing.context.BaseContext:
     return context
 
 
-def run(arguments: list[str], log: Path, journal: Path | None = None, disk: int = 0) -> None:
+def run(arguments: list[str], log: Path, journal: Path | None = None, disk: int = 0, temporary: str = "") -> None:
     """A launch in a process of its own, which says to `log` what it has to say and, to `journal`, each checkpoint
-    before and after it was written: "begun 3", "done 3". disk: limit on the size of its files, 0: none."""
+    before and after it was written: "begun 3", "done 3". disk: limit on the size of its files, 0: none. temporary: its
+    folder for temporary files."""
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
@@ -54,6 +55,8 @@ def run(arguments: list[str], log: Path, journal: Path | None = None, disk: int 
 
     torch.set_num_threads(1)
     sys.argv = ["launch.py", *arguments]
+    if temporary:
+        os.environ["TMPDIR"], tempfile.tempdir = temporary, None
     if disk:
         import resource
 

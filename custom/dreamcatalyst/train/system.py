@@ -383,8 +383,11 @@ class SplatSystem(System):
         checkpoint["run"] = {"system": type(self).__name__, **self.record.state_dict()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        if "splats" not in checkpoint:
-            raise SceneError(f"resume: the checkpoint holds no splats (found {', '.join(checkpoint)}).")
+        lacking = {"splats", "run"} - set(checkpoint)
+        if lacking:
+            raise SceneError(
+                f"resume: the checkpoint holds no {' and no '.join(lacking)} (found {', '.join(checkpoint)})."
+            )
         maker, mine = checkpoint["run"]["system"], type(self).__name__
         if maker != mine:
             hint = "To begin from its splats, give their PLY: system.gs_source=<trial>/save/last.ply"
