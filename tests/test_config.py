@@ -6,11 +6,19 @@ import math
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 from dreamcatalyst.config import (
+    AtLeastOne,
     ExperimentConfig,
+    Fraction,
+    Number,
+    Positive,
+    Range,
+    Rate,
     Scalar,
+    Seed,
     check,
     corners,
     largest,
@@ -24,7 +32,7 @@ from dreamcatalyst.config import (
 from dreamcatalyst.errors import ConfigError
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, ValidationError
 
 
 class Colour(Enum):
@@ -107,7 +115,7 @@ def test_every_kind_of_field_is_filled():
         ({"inner": {"threshold": [0, 1, "x"]}}, "system.inner.threshold: a schedule holds numbers only, and 'x'"),
         ({"inner": {"threshold": [9, 0, 1, 5]}}, "system.inner.threshold: the times of a schedule must increase"),
         ({"size": [3]}, "system.size: got"),
-        ({"steps": ["a"]}, "system.steps: got ['a'] (list)"),
+        ({"steps": ["a"]}, "system.steps[0]: got 'a' (str), expected float"),
         ({"colour": "GREEN"}, "system.colour: got 'GREEN' (str)"),
         ({"free": 3}, "system.free: got 3 (int), expected dict"),
         ({"limit": -1}, "system: limit: got -1.0, expected 0 or more"),
@@ -118,6 +126,63 @@ def test_what_is_refused_is_named_with_its_place(bad, said):
     with pytest.raises(ConfigError) as error:
         parse(Outer, section, "system")
     assert said in str(error.value)
+
+
+@dataclass(frozen=True)
+class Ranges:
+    part: Fraction = 0.5
+    beta: Annotated[float, Range("[0, 1)")] = 0.9
+    rate: Rate = 1.0
+    size: Positive | None = None
+    colour: tuple[Fraction, Fraction, Fraction] = (0.0, 0.0, 0.0)
+    widths: tuple[AtLeastOne, ...] = (1,)
+    shift: Number = 0.0
+    seed: Seed = 0
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"part": 1.5}, "system.part: got 1.5 (float), expected a number in [0, 1]."),
+        ({"part": "nan"}, "system.part: got 'nan' (str), expected a finite number."),
+        ({"part": True}, "system.part: got True (bool), expected float."),
+        ({"beta": 1}, "system.beta: got 1.0 (float), expected a number in [0, 1)."),
+        ({"rate": -1}, "system.rate: got -1 (int), expected 0 or more."),
+        ({"rate": [0, 1.0, -2.0, 10]}, "system.rate: got -2.0 in [0, 1.0, -2.0, 10] (list), expected 0 or more."),
+        ({"rate": float("inf")}, "system.rate: got inf (float), expected finite numbers."),
+        ({"rate": [0, 1.0, float("nan"), 10]}, "system.rate: got [0, 1.0, nan, 10] (list), expected finite numbers."),
+        ({"rate": 10**400}, ", expected finite numbers."),
+        ({"size": 0}, "system.size: got 0.0 (float), expected more than 0."),
+        ({"colour": [0, 2, 0]}, "system.colour[1]: got 2.0 (float), expected a number in [0, 1]."),
+        ({"colour": [0, True, 0]}, "system.colour[1]: got True (bool), expected float."),
+        ({"colour": [0, 0]}, "system.colour: got 2 values, expected 3 (tuple[float, float, float])."),
+        ({"colour": 0.5}, "system.colour: got 0.5 (float), expected tuple[float, float, float]."),
+        ({"widths": [4, 0]}, "system.widths[1]: got 0 (int), expected 1 or more."),
+        ({"shift": 10**400}, ", expected float."),
+        ({"shift": float("-inf")}, "system.shift: got -inf (float), expected a finite number."),
+        ({"seed": -1}, "system.seed: got -1 (int), expected a number in [0, 4294967295]."),
+    ],
+)
+def test_a_number_outside_of_its_range_is_refused(given, said):
+    with pytest.raises(ConfigError) as error:
+        parse(Ranges, given, "system")
+    assert said in str(error.value)
+
+
+def test_the_ends_of_a_range_are_inside_where_its_brackets_are_square():
+    ends = {"part": 1, "beta": 0, "rate": [0, 0.0, 1.0, 5, 0.0, 9], "colour": [0, 1, 0.5], "size": 1e-300, "shift": -3}
+    filled = parse(Ranges, ends)
+    assert (filled.part, filled.beta, filled.size, filled.shift) == (1.0, 0.0, 1e-300, -3.0)
+    assert filled.colour == (0.0, 1.0, 0.5) and filled.rate == (0, 0.0, 1.0, 5, 0.0, 9)
+    # A schedule's times may be anything; only its values are in the range.
+    assert parse(Ranges, {"rate": [-5, 1.0, 2.0, 10]}).rate == (-5, 1.0, 2.0, 10)
+
+
+def test_the_hosts_parser_sees_ranges_as_plain_numbers():
+    node = OmegaConf.structured(Ranges(part=0.25))
+    assert node.part == 0.25 and OmegaConf.merge(node, {"part": 7}).part == 7.0
+    with pytest.raises(ValidationError):
+        OmegaConf.merge(node, {"part": "much"})
 
 
 def test_a_registered_class_is_validated_with_its_parts():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 import time
 import types
 import typing
@@ -23,12 +24,53 @@ from omegaconf.errors import OmegaConfBaseException
 from .errors import ConfigError, choose, nearest, unknown
 from .files import folder_name, write_text
 
-Scalar = Annotated[float, "schedule"]
-"""A number, or a schedule of it: [v0, v1, end], [start, v0, v1, end] or [start, v0, v1, s1, v2, s2, ...]; see `value`.
-OmegaConf, and so the host's parser, takes the annotation for `float`."""
-
 TIMESTAMP = "@%Y%m%d-%H%M%S"  # of a run's start, in its folder's name
+LARGEST = sys.float_info.max
 _SCHEDULE = "[v0, v1, end], [start, v0, v1, end] or [start, v0, v1, s1, v2, s2, ...]"
+
+
+# --- what a number may be: annotations of config fields; OmegaConf, and so the host, sees int and float ---------------
+
+
+class Range:
+    """Which numbers a field takes, as an interval: "[0, 1)" holds 0 and not 1. Infinity is never inside.
+
+    Stands in an annotation, `rate: Annotated[float, Range("[0, inf)")]`, and goes for every number of the field: each
+    element of a tuple, and each value of a schedule.
+    """
+
+    def __init__(self, interval: str):
+        self.interval = interval
+        low, high = interval[1:-1].split(",")
+        self.low, self.high = float(low), float(high)
+        self._open = interval[0] == "(", interval[-1] == ")"
+
+    def __contains__(self, number: float) -> bool:
+        above = number > self.low if self._open[0] else number >= self.low
+        below = number < self.high if self._open[1] else number <= self.high
+        return above and below and -math.inf < number < math.inf
+
+    def __str__(self) -> str:
+        if math.isinf(self.low) and math.isinf(self.high):
+            return "a finite number"
+        if math.isinf(self.high):
+            return f"more than {self.low:g}" if self._open[0] else f"{self.low:g} or more"
+        return f"a number in {self.interval}"
+
+
+Number = Annotated[float, Range("(-inf, inf)")]
+Positive = Annotated[float, Range("(0, inf)")]
+NonNegative = Annotated[float, Range("[0, inf)")]
+Fraction = Annotated[float, Range("[0, 1]")]
+Integer = Annotated[int, Range("(-inf, inf)")]
+Count = Annotated[int, Range("[0, inf)")]
+AtLeastOne = Annotated[int, Range("[1, inf)")]
+Seed = Annotated[int, Range("[0, 4294967295]")]  # what all generators of random numbers take
+Side = Annotated[int, Range("[1, 32766]")]  # pixels; OpenCV resamples no longer sides
+
+Scalar = Annotated[float, "schedule"]
+"""A number or a schedule of it, [v0, v1, end], [start, v0, v1, end] or [start, v0, v1, s1, v2, s2, ...]; `value`."""
+Rate = Annotated[Scalar, Range("[0, inf)")]
 
 
 # --- one dataclass ---------------------------------------------------------------------------------------------------
@@ -38,10 +80,11 @@ def parse(cls: type, node: Any, where: str = "", base: Any = None) -> Any:
     """Return `cls` filled from `node`, with the defaults of `cls` (or of the instance `base`) where it is silent.
 
     cls: a dataclass, frozen or not; its fields may be primitives, Optional, lists, tuples, dicts, Enums, `Scalar`, or
-    dataclasses, which are parsed in turn. A field with metadata {"choices": [...]} takes only those. A bare `dict` or
-    `Any` is handed through as it is. `where`: the key under which node stands, for messages ("system.densify").
-    Raises ConfigError for a key that cls does not have, a value of another type, and `???`; a ConfigError of the
-    class's own __post_init__ gets the place in front.
+    dataclasses, which are parsed in turn. A field with metadata {"choices": [...]} takes only those, one annotated with
+    a `Range` only numbers inside. A bare `dict` or `Any` is handed through as it is. `where`: the key under which node
+    stands, for messages ("system.densify"). Raises ConfigError for a key that cls does not have, a value of another
+    type or outside of its range, a number that is not finite, and `???`; a ConfigError of the class's own
+    __post_init__ gets the place in front.
     """
     node = OmegaConf.create({}) if node is None else node
     if not isinstance(node, (Mapping, DictConfig)):
@@ -92,28 +135,52 @@ def _convert(hint: Any, raw: Any, place: str, default: Any) -> Any:
     hint, optional = _unwrap(hint)
     if raw is None and (optional or hint is Any):
         return None
-    if hint == Scalar:
-        return _scalar(raw, place)
+    hint, *notes = _notes(hint)
+    if notes:
+        return _ranged(hint, notes, raw, place)
     if dataclasses.is_dataclass(hint):
         return parse(hint, raw, place, default if isinstance(default, hint) else None)
     if hint is Any or (hint is dict and isinstance(raw, DictConfig)):
         return raw
+    if typing.get_origin(hint) in (tuple, list) and isinstance(raw, (list, tuple, ListConfig)):
+        return _sequence(hint, raw, place)
     leaf = OmegaConf.structured(dataclasses.make_dataclass("Leaf", [("value", hint)]))
     try:
         if isinstance(raw, bool) and hint in (int, float):
             raise ValueError
         result = OmegaConf.merge(leaf, {"value": raw}).value
-    except (OmegaConfBaseException, ValueError) as error:
+    except (OmegaConfBaseException, ValueError, OverflowError) as error:
         raise ConfigError(f"{place}: got {_show(raw)}, expected {_expected(hint)}.") from error
-    result = OmegaConf.to_object(result) if OmegaConf.is_config(result) else result
-    return _tuple(hint, result, place) if typing.get_origin(hint) is tuple else result
+    if isinstance(result, float) and not math.isfinite(result):
+        raise ConfigError(f"{place}: got {_show(raw)}, expected a finite number.")
+    return OmegaConf.to_object(result) if OmegaConf.is_config(result) else result
 
 
-def _tuple(hint: Any, values: Sequence, place: str) -> tuple:
-    args = typing.get_args(hint)
-    if Ellipsis not in args and len(values) != len(args):
-        raise ConfigError(f"{place}: got {len(values)} values, expected {len(args)} ({_expected(hint)}).")
-    return tuple(values)
+def _sequence(hint: Any, raw: Sequence, place: str) -> tuple | list:
+    """The elements of a tuple or a list, each converted for itself."""
+    kind, hints = typing.get_origin(hint), typing.get_args(hint)
+    if kind is list or Ellipsis in hints:
+        hints = hints[:1] * len(raw)
+    elif len(raw) != len(hints):
+        raise ConfigError(f"{place}: got {len(raw)} values, expected {len(hints)} ({_expected(hint)}).")
+    return kind(_convert(h, item, f"{place}[{i}]", None) for i, (h, item) in enumerate(zip(hints, raw, strict=True)))
+
+
+def _ranged(hint: Any, notes: Sequence, raw: Any, place: str) -> Any:
+    """`raw` as an annotated number: a schedule where that is among the notes, and inside the range that is."""
+    schedule = "schedule" in notes
+    result = _scalar(raw, place) if schedule else _convert(hint, raw, place, None)
+    for number in values_of(result) if schedule else [result]:
+        for limits in notes:
+            if isinstance(limits, Range) and number not in limits:
+                within = f" in {_show(raw)}" if isinstance(result, tuple) else f" ({type(number).__name__})"
+                raise ConfigError(f"{place}: got {number}{within}, expected {limits}.")
+    return result
+
+
+def _notes(hint: Any) -> tuple[Any, ...]:
+    """An annotated type and what it is annotated with."""
+    return (hint.__origin__, *hint.__metadata__) if hasattr(hint, "__metadata__") else (hint,)
 
 
 def _unwrap(hint: Any) -> tuple[Any, bool]:
@@ -128,8 +195,12 @@ def _unwrap(hint: Any) -> tuple[Any, bool]:
 
 def _expected(hint: Any) -> str:
     inner, optional = _unwrap(hint)
-    if inner == Scalar:
+    inner, *notes = _notes(inner)
+    if "schedule" in notes:
         name = f"a number or a schedule {_SCHEDULE}"
+    elif typing.get_origin(inner) in (tuple, list):
+        items = ["..." if a is Ellipsis else _expected(a) for a in typing.get_args(inner)]
+        name = f"{typing.get_origin(inner).__name__}[{', '.join(items)}]"
     else:
         name = inner.__name__ if isinstance(inner, type) and not typing.get_args(inner) else str(inner)
     return f"{name.replace('typing.', '')}{' or null' if optional else ''}"
@@ -149,13 +220,14 @@ def _number(raw: Any) -> bool:
 
 
 def _scalar(raw: Any, place: str) -> float | tuple[int | float, ...]:
-    """A number as it is, a schedule as a tuple that keeps its ints and floats apart (they choose the clock)."""
+    """A number as it is, a schedule as a tuple that keeps its ints and floats apart (they choose the clock). All are
+    finite."""
     if _number(raw):
-        return raw
+        return _finite(raw, raw, place)
     wrong = ConfigError(f"{place}: got {_show(raw)}, expected {_expected(Scalar)}.")
     if isinstance(raw, str):
         try:
-            return float(raw)
+            return _finite(float(raw), raw, place)
         except ValueError as error:
             raise wrong from error
     if not isinstance(raw, (list, tuple, ListConfig)):
@@ -163,12 +235,20 @@ def _scalar(raw: Any, place: str) -> float | tuple[int | float, ...]:
     for item in raw:
         if not _number(item):
             raise ConfigError(f"{place}: a schedule holds numbers only, and {_show(item)} is none: {list(raw)}.")
+        _finite(item, raw, place)
     if len(raw) not in (3, 4) and (len(raw) < 6 or len(raw) % 2):
         raise ConfigError(f"{place}: a schedule of {len(raw)} numbers, expected {_SCHEDULE}.")
     times = [time for time, _ in _knots(raw)]
     if any(a >= b for a, b in zip(times, times[1:], strict=False)):
         raise ConfigError(f"{place}: the times of a schedule must increase, got {times} in {list(raw)} ({_SCHEDULE}).")
     return tuple(raw)
+
+
+def _finite(number: int | float, raw: Any, place: str) -> int | float:
+    """The number. Raises ConfigError where a float cannot hold it, or it is none."""
+    if not -LARGEST <= number <= LARGEST:
+        raise ConfigError(f"{place}: got {_show(raw)}, expected finite numbers.")
+    return number
 
 
 def _knots(schedule: Sequence[int | float]) -> list[tuple[int | float, int | float]]:
@@ -198,9 +278,14 @@ def value(scalar: Scalar | Sequence, epoch: int, step: int, interpolation: str =
     return math.exp(math.log(first) * (1 - t) + math.log(last) * t)
 
 
+def values_of(scalar: Scalar | Sequence) -> list[float]:
+    """The values at the corners of a schedule, between which it stays; of a number, that."""
+    return [scalar] if _number(scalar) else [v for _, v in _knots(_scalar(scalar, "schedule"))]
+
+
 def largest(scalar: Scalar | Sequence) -> float:
     """The largest value that a number or schedule takes."""
-    return scalar if _number(scalar) else max(v for _, v in _knots(_scalar(scalar, "schedule")))
+    return max(values_of(scalar))
 
 
 def corners(scalar: Scalar | Sequence) -> list[int | float]:
@@ -218,14 +303,14 @@ class ExperimentConfig:
     name: str = "default"  # the experiment's folder under exp_root_dir
     description: str = ""
     tag: str = ""  # the trial's folder is tag + timestamp
-    seed: int = 0
+    seed: Seed = 0
     use_timestamp: bool = True
     timestamp: str | None = None  # null: the time of the start, as TIMESTAMP
     exp_root_dir: str = "outputs"
     exp_dir: str = ""
     trial_name: str = ""
     trial_dir: str = ""
-    n_gpus: int = 1
+    n_gpus: Count = 1
     resume: str | None = None  # a checkpoint to go on from, in the trial where it lies
     data_type: str = ""
     data: dict = field(default_factory=dict)
