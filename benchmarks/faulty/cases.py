@@ -25,8 +25,9 @@ import launch
 
 ROOT = Path(launch.__file__).resolve().parent
 SECONDS = 8.0  # processor seconds until an error comes at most: nothing long may have been begun
-HANG = 90  # seconds after which a case is ended
+HANG = 40  # seconds after which a case is ended
 MEMORY = 8 * 2**30  # bytes that a case may ask for: what would take more fails there, and not the machine
+COMMAND = ("cmd.txt", "configs/raw.yaml", "configs/parsed.yaml")  # of a trial: how it was begun, or resumed
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 TINY = {
     "data.max_side": "24",
@@ -145,14 +146,15 @@ class Place:
         self._before = {name: digest(path) for name, path in self.files().items()}
 
     def finish(self, outcome: Outcome) -> Outcome:
-        """The outcome with what is left on disk, and what was lost. A run that goes on may write into its trial."""
+        """The outcome with what is left on disk, and what was lost. A run that goes on may write into its trial, and
+        one that resumes writes there at once by which command it did."""
         now, before = self.files(), self._before or {}
         outcome.left = {name: path.lstat().st_size for name, path in sorted(now.items()) if name not in before}
         own = "work/outputs/" if outcome.status == 0 else "no folder"
         outcome.lost += [
             name
             for name, was in before.items()
-            if name not in now or (digest(now[name]) != was and not name.startswith(own))
+            if name not in now or (digest(now[name]) != was and not name.startswith(own) and not name.endswith(COMMAND))
         ]
         return outcome
 
@@ -170,15 +172,16 @@ def digest(path: Path) -> str:
 @contextlib.contextmanager
 def printed(path: Path) -> Iterator[None]:
     """All that is printed, by Python or below it, goes into the file."""
-    with path.open("a", buffering=1, encoding="utf-8", errors="replace") as file:
+    # The streams stay what they are: libraries that are imported meanwhile hold on to them.
+    with path.open("a") as file:
         sys.stdout.flush(), sys.stderr.flush()
         kept = [os.dup(number) for number in (1, 2)]
         for number in (1, 2):
             os.dup2(file.fileno(), number)
         try:
-            with contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
-                yield
+            yield
         finally:
+            sys.stdout.flush(), sys.stderr.flush()
             for number, copy in zip((1, 2), kept, strict=True):
                 os.dup2(copy, number)
                 os.close(copy)

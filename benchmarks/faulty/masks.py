@@ -142,7 +142,6 @@ CASES: list[Case] = [
         ["system.mask.kind=text", "system.mask.options={text: bear, model: no/no}"],
         "mask",
     ),
-    mask("relevance: on a prior that did not learn", ["system.mask.kind=relevance"], "relevance"),
     mask("cache: a file where its folder should be", occupied, "kept"),
     cached("a flipped bit is found and the mask made again", flip, "made again"),
     cached("an empty file is made again", lambda p: p.write_bytes(b""), "made again"),

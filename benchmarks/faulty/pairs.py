@@ -12,7 +12,8 @@ from .things import pair_arrays
 SMALL = [
     "data.count=8",
     "data.held_out=4",
-    "data.size=8",
+    "data.size=32",
+    "system.autoencoder.crop=32",
     "data.pairs=pairs",
     "trainer.max_steps=2",
     "system.autoencoder.steps=1",
@@ -70,7 +71,7 @@ CASES: list[Case] = [
     prior("a shard without instructions", shard(lambda a: a.pop("instruction")), "pairs-00001.npz", "instruction"),
     prior("lists of unequal length", shard(lambda a: a.update(edited=a["edited"][:3])), "pairs-00001.npz", "edited"),
     prior("pictures of another size", shard(lambda a: a.update(pair_arrays(1, size=16))), "pairs-00001.npz"),
-    prior("data.size of another size", lambda p: p.copy("pairs") and ["data.size=16"], "data.size"),
+    prior("data.size of another size", lambda p: p.copy("pairs") and ["data.size=64"], "data.size"),
     prior("pictures as numbers from 0 to 1", shard(lambda a: a.update(source=a["source"] / 255)), "source", "uint8"),
     prior("pictures without colour", shard(lambda a: a.update(source=a["source"][..., 0])), "source"),
     prior("instructions that are numbers", shard(lambda a: a.update(instruction=np.arange(8))), "instruction"),
@@ -83,7 +84,7 @@ CASES: list[Case] = [
     ),
     prior(
         "pairs.json of other settings",
-        lambda p: p.copy("pairs") and p.write("pairs/pairs.json", '{"seed": 7, "size": 8, "shard": 250}') and None,
+        lambda p: p.copy("pairs") and p.write("pairs/pairs.json", '{"seed": 7, "size": 32, "shard": 250}') and None,
         "pairs",
         "seed",
     ),

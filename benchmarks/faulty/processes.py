@@ -178,9 +178,7 @@ def killed_writing(place: Place) -> Outcome:
 def killed_by_default(place: Place) -> Outcome:
     """SIGKILL of a run in which only the clock says when to keep a checkpoint."""
     inputs(place)
-    words = [*LONG, "checkpoint.train_time_interval=00:00:00:02"]
-    words.remove("checkpoint.every_n_train_steps=1000000")
-    job = Job(place, arguments("closed-form", words))
+    job = Job(place, arguments("closed-form", [*LONG, "checkpoint.minutes=0.03"]))
     job.until((place.work / TRIAL / "ckpts/last.ckpt").exists, "a checkpoint by the clock")
     job.kill()
     return place.finish(Outcome(137, job.text, faults=usable(place, "ckpts/last.ckpt")))
@@ -305,9 +303,9 @@ def broken_kernels(place: Place) -> Outcome:
 
 CASES: list[Case] = [
     process("Ctrl-C while training", signalled(signal.SIGINT), "last.ckpt", status=130),
-    process("Ctrl-C twice", signalled(signal.SIGINT, signal.SIGINT), "nterrupted", status=130),
-    process("Ctrl-C while loading", early, "nterrupted", status=130),
-    process("Ctrl-C while the result is pictured", testing, "nterrupted", status=130),
+    process("Ctrl-C twice", signalled(signal.SIGINT, signal.SIGINT), "stopped by Ctrl-C", status=130),
+    process("Ctrl-C while loading", early, "stopped by Ctrl-C", status=130),
+    process("Ctrl-C while the result is pictured", testing, "stopped by Ctrl-C", status=130),
     process("SIGTERM, as a batch system sends", signalled(signal.SIGTERM), "last.ckpt", status=143),
     process("SIGHUP, as a closed terminal sends", signalled(signal.SIGHUP), "last.ckpt", status=129),
     process("SIGKILL while a checkpoint is written, three times", killed_writing, status=137),

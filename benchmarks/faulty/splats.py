@@ -126,7 +126,7 @@ CASES: list[Case] = [
     ply(
         "an element twice",
         header("format ascii 1.0", "element vertex 0", "property float x", "element vertex 0", "property float x"),
-        "vertex",
+        "scene.ply",
     ),
     ply("a format that is not known", header("format binary 1.0", "element vertex 1"), "format"),
     ply("a number type that is not known", header("format ascii 1.0", "element vertex 1", "property half x"), "half x"),
@@ -152,8 +152,13 @@ CASES: list[Case] = [
     ),
     ply("huge scales (not logarithms: 1e30)", with_values(3, scale_0=1e30), "scale"),
     ply("scales whose exponential overflows", with_values(20, scale_0=100, scale_1=100, scale_2=100), "scale"),
-    ply("zero quaternions", with_values(3, rot_0=0, rot_1=0, rot_2=0, rot_3=0), "rot"),
-    ply("all splats at one place", with_values(20, x=0, y=0, z=0), "place"),
+    ply(
+        "zero quaternions: the run goes on",
+        with_values(3, rot_0=0, rot_1=0, rot_2=0, rot_3=0),
+        "wrote",
+        status=0,
+        seconds=30,
+    ),
     ply("positions of 1e30", with_values(20, x=1e30), "scene.ply"),
     ply(
         "another PLY as the original that is not there",

@@ -123,13 +123,13 @@ def trial(*overrides: str, config: str = "closed-form") -> Callable[[Path], None
 
 
 def pairs(path: Path) -> None:
-    """Training pairs of one's own, 8 x 8 pixels: four worlds with four pairs each."""
+    """Training pairs of one's own, 32 x 32 pixels: four worlds with four pairs each."""
     path.mkdir()
     for shard in range(2):
         np.savez(path / f"pairs-{shard:05d}.npz", **pair_arrays(shard))
 
 
-def pair_arrays(shard: int, n: int = 8, size: int = 8) -> dict[str, np.ndarray]:
+def pair_arrays(shard: int, n: int = 8, size: int = 32) -> dict[str, np.ndarray]:
     """The arrays of a shard."""
     draw = np.random.default_rng(shard)
     return dict(

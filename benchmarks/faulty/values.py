@@ -47,7 +47,7 @@ EDIT: dict[str, tuple[str, ...]] = {
     "system.loss": ("{lambda_guidance: -1}", "{lambda_guidance: nan}", "{lambda_perceptual: 10}", "[]"),
     "system.renderer.background": ("[2,0,0]", "black", "[0,0]", "[nan,0,0]"),
     "system.renderer.cache_mib": ("-1",),
-    "system.renderer.antialiased": ("maybe", "2"),
+    "system.renderer.antialiased": ("maybe",),
     "system.source_cache_mib": ("-1", "lots"),
     "system.report.every": ("-1",),
     "system.report.views": ("0",),
@@ -90,8 +90,9 @@ BOX = ["system.mask.kind=box", "system.mask.options={low: [-9, -9, -9], high: [9
 
 
 def blamed(key: str) -> str:
-    """The text that a message must hold: the last part of the key."""
-    return key.rpartition(".")[2]
+    """The text that a message must hold: the last part of the key; of Lightning's own checks, the section."""
+    section, _, last = key.rpartition(".")
+    return section if section in ("trainer", "checkpoint") and last != "max_steps" else last
 
 
 def refused(key: str, value: str, *before: str, config: str = "closed-form") -> Case:
