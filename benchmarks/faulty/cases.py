@@ -28,6 +28,8 @@ SECONDS = 8.0  # processor seconds until an error comes at most: nothing long ma
 HANG = 40  # seconds after which a case is ended
 MEMORY = 8 * 2**30  # bytes that a case may ask for: what would take more fails there, and not the machine
 COMMAND = ("cmd.txt", "configs/raw.yaml", "configs/parsed.yaml")  # of a trial: how it was begun, or resumed
+# Standard output and error for the whole process: libraries that are imported in a case hold on to them.
+STREAMS = [open(n, "w", 1, "utf-8", "replace", closefd=False) for n in (1, 2)]  # noqa: SIM115, PTH123
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 TINY = {
     "data.max_side": "24",
@@ -172,16 +174,15 @@ def digest(path: Path) -> str:
 @contextlib.contextmanager
 def printed(path: Path) -> Iterator[None]:
     """All that is printed, by Python or below it, goes into the file."""
-    # The streams stay what they are: libraries that are imported meanwhile hold on to them.
     with path.open("a") as file:
         sys.stdout.flush(), sys.stderr.flush()
         kept = [os.dup(number) for number in (1, 2)]
         for number in (1, 2):
             os.dup2(file.fileno(), number)
         try:
-            yield
+            with contextlib.redirect_stdout(STREAMS[0]), contextlib.redirect_stderr(STREAMS[1]):
+                yield
         finally:
-            sys.stdout.flush(), sys.stderr.flush()
             for number, copy in zip((1, 2), kept, strict=True):
                 os.dup2(copy, number)
                 os.close(copy)
