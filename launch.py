@@ -34,7 +34,9 @@ def arguments(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
         epilog='Any key of the YAML may follow as key=value: system.prompt_processor.prompt="Make it sunset", '
         "trainer.max_steps=500, trainer.accelerator=cpu, resume=outputs/.../ckpts/last.ckpt.",
     )
-    parser.add_argument("--config", metavar="YAML", help="what to run: a file such as configs/dc-ge.yaml")
+    parser.add_argument(
+        "--config", metavar="YAML", action="append", help="what to run: a file such as configs/dc-ge.yaml"
+    )
     mode = parser.add_mutually_exclusive_group()
     for name, text in {
         "train": "train, then test (the default)",
@@ -52,6 +54,9 @@ def arguments(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
     args, overrides = parser.parse_known_args(argv)
     if not args.config and not args.link:
         parser.error("--config is needed: a file of configs/, such as --config configs/dc-ge.yaml")
+    if args.config and len(args.config) > 1:
+        parser.error(f"--config is given {len(args.config)} times, expected one file")
+    args.config = args.config[0] if args.config else None
     return args, overrides
 
 
@@ -246,15 +251,18 @@ def make_trainer(config: Any, callbacks: list[Any], checkpoints: Any, training: 
     for name, whole in {"limit_train_batches": (None, 1.0), "overfit_batches": (None, 0)}.items() if training else ():
         if options.get(name) not in whole or isinstance(options.get(name), bool):
             raise ConfigError(f"trainer.{name}: leave it out: what ends a run is trainer.max_steps alone.")
+    where = "trainer"  # the section that is to blame
     try:
         if training and options["enable_checkpointing"]:
             checkpoint = known_options(ModelCheckpoint, config.checkpoint, "checkpoint", {"minutes"})
             # Without a counter, last.ckpt is the last one in a resumed run too.
             ours = {"dirpath": Path(config.trial_dir) / "ckpts", "enable_version_counter": False}
+            where = "checkpoint"
             callbacks = [*callbacks, ModelCheckpoint(**ours | checkpoint)]
+            where = "trainer"
         trainer = Trainer(callbacks=callbacks, **options)
-    except (MisconfigurationException, ValueError, ImportError) as error:
-        raise ConfigError(f"trainer: {error}") from error
+    except (MisconfigurationException, ValueError, TypeError, ImportError) as error:
+        raise ConfigError(f"{where}: {' '.join(str(error).split())}") from error
     if trainer.world_size > 1:
         raise ConfigError(f"trainer: asks for {trainer.world_size} processes, expected one: set trainer.devices=1.")
     return trainer

@@ -226,7 +226,9 @@ def test_lightnings_own_talk_is_left_out_unless_asked_for(toy):
         (["trainer.max_steps=0"], "trainer.max_steps: got 0 (int), expected a whole number, 1 or more"),
         (["trainer.max_steps=-1"], "trainer.max_steps: got -1 (int), expected a whole number, 1 or more"),
         (["trainer.devices=2", "trainer.accelerator=cpu"], "trainer: asks for 2 processes, expected one"),
-        (["seed=-1"], "seed: -1 is not in bounds"),
+        (["trainer.devices=-1", "trainer.accelerator=cpu"], "trainer: `devices` selected"),
+        (["checkpoint.every_n_train_steps=often"], "checkpoint: "),
+        (["seed=-1"], "seed: got -1"),
         (["resume=nowhere.ckpt"], "resume: there is no checkpoint 'nowhere.ckpt'"),
         (["--trian"], "'--trian' on the command line is neither a flag nor key=value"),
         (["--preview"], "--preview: ToySystem has none"),
@@ -237,6 +239,12 @@ def test_an_error_of_the_users_is_one_line(toy, capsys, arguments, said):
     *before, told = capsys.readouterr().err.strip().splitlines()
     assert told.startswith("error: ") and said in told
     assert not any("Traceback" in line for line in before)
+
+
+def test_one_config_is_run_and_not_the_last_of_several(toy, capsys):
+    with pytest.raises(SystemExit) as ended:
+        launch.main(["--config", str(toy), "--config", str(toy)])
+    assert ended.value.code == 2 and "--config is given 2 times" in capsys.readouterr().err
 
 
 def test_verbose_errors_keep_their_traceback(toy, capsys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import hashlib
 import logging
 import os
@@ -214,7 +213,6 @@ def unchanged(folder: Path) -> Iterator[None]:
         torch.set_default_dtype(state[0])
         torch.set_grad_enabled(state[1])
         torch.set_num_threads(state[2])
-        gc.collect()
 
 
 def launched(place: Place, arguments: Sequence[str]) -> Outcome:

@@ -118,3 +118,42 @@ def test_a_contact_sheet_shows_pairs_side_by_side(made):
     assert np.array_equal(sheet[:SIZE, :SIZE], made["source"][0])
     assert np.array_equal(sheet[:SIZE, 3 * SIZE :], made["edited"][1])
     assert (sheet[-(SIZE + CAPTION) :, 2 * SIZE :] == 255).all()  # the sixth place is empty
+
+
+GOOD = dict(
+    source=np.zeros((2, 4, 4, 3), np.uint8),
+    edited=np.zeros((2, 4, 4, 3), np.uint8),
+    mask=np.zeros((2, 4, 4), np.uint8),
+    instruction=np.array(["snow", "snow"]),
+    edit=np.array(["snow", "snow"]),
+    world=np.array([1, 2]),
+)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"mask": None}, "has no 'mask'"),
+        ({"source": GOOD["source"] / 255}, "'source' is float64"),
+        ({"edited": GOOD["edited"][:1]}, r"'edited' is uint8 \[1, 4, 4, 3\], expected uint8 \[2, 4, 4, 3\]"),
+        ({"source": GOOD["source"][..., 0]}, "'source' is uint8"),
+        ({"instruction": np.arange(2)}, "'instruction' is int64"),
+        ({"world": GOOD["edit"]}, "'world' is <U4"),
+        ({"edit": np.array([{}, {}])}, "is no shard of pairs"),
+        ({name: array[:0] for name, array in GOOD.items()}, r"'world' is int64 \[0\]"),
+    ],
+)
+def test_a_shard_of_anything_else_is_refused_by_its_name(tmp_path, arrays, said):
+    np.savez(tmp_path / "pairs-00000.npz", **GOOD)
+    assert len(read_pairs(tmp_path)["world"]) == 2
+    spoiled = {name: array for name, array in {**GOOD, **arrays}.items() if array is not None}
+    np.savez(tmp_path / "pairs-00001.npz", **spoiled)
+    with pytest.raises(DataError, match=f"pairs-00001.npz: {said}"):
+        read_pairs(tmp_path)
+
+
+def test_a_shard_that_is_no_archive_is_refused(tmp_path):
+    for junk in (b"", b"junk", b"PK" + bytes(99)):
+        (tmp_path / "pairs-00000.npz").write_bytes(junk)
+        with pytest.raises(DataError, match="pairs-00000.npz: is no shard of pairs, or is damaged"):
+            read_pairs(tmp_path)

@@ -168,6 +168,42 @@ def test_a_wrong_folder_is_refused_with_the_remedy(models, tmp_path, kind, name,
         PRIORS.get(kind)(Ip2pConfig(str(path)))
 
 
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("unet/config.json", "[]", "holds a list, expected an object"),
+        ("text_encoder/config.json", "[]", "holds a list, expected an object"),
+        ("unet/config.json", "\xe9", "not valid JSON"),
+        ("tokenizer/vocab.json", "[]", "tokenizer: cannot be loaded"),
+        ("tokenizer/vocab.json", '{"a', "tokenizer: cannot be loaded"),
+        ("tokenizer/merges.txt", "", "merges.txt: is empty"),
+        ("text_encoder/model.safetensors", "half", "text_encoder: cannot be loaded as CLIPTextModel"),
+        ("instructions.json", '{"snow": ["make', "instructions.json: not valid JSON"),
+        ("instructions.json", '["snow"]', "instructions.json: holds a list"),
+        ("instructions.json", '{"snow": [1]}', "instructions.json: expected a list of wordings"),
+    ],
+)
+def test_a_damaged_file_of_a_folder_is_named(models, tmp_path, file, content, message):
+    path = break_folder(models, tmp_path, "ip2p", lambda p: (p / file).write_text(content, encoding="latin-1"))
+    with pytest.raises(PriorError, match=message):
+        InstructPix2Pix(Ip2pConfig(str(path)))
+
+
+@pytest.mark.parametrize(
+    ("file", "values"),
+    [
+        ("vae", {"block_out_channels": 64}),
+        ("scheduler", {"beta_start": "low"}),
+        ("text_encoder", {"num_attention_heads": "many"}),
+    ],
+)
+def test_a_config_of_which_no_model_can_be_made_is_named(models, tmp_path, file, values):
+    name = "scheduler_config.json" if file == "scheduler" else "config.json"
+    path = break_folder(models, tmp_path, "ip2p", lambda p: edit_json(p / file / name, **values))
+    with pytest.raises(PriorError, match=f"{file}: its config cannot be used"):
+        InstructPix2Pix(Ip2pConfig(str(path)))
+
+
 def test_a_path_that_is_nowhere_is_refused(tmp_path):
     with pytest.raises(PriorError, match="no such folder. Give a folder with unet.*Hugging Face id"):
         InstructPix2Pix(Ip2pConfig(str(tmp_path / "nowhere")))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.random import Generator
 from torch import Tensor
 
 from ..data.camera import Cameras
+from ..data.views import read_json
 from ..errors import DataError
 from ..files import replacing, write_text
 from ..render.api import rasterize
@@ -27,6 +28,16 @@ CAMERAS, EDITS_PER_SOURCE = 3, 4  # a world gives up to their product in pairs, 
 PHOTOGRAPHED = 0.2  # how often a photograph is drawn in place of a world: about one pair in thirteen
 VISIBLE = 0.03  # a pixel belongs to the object where its splats make up more than this of it
 SEEN = 0.01  # an object that covers less of the picture than this is no target there
+
+PAIRS = ("pairs", "height", "width", "channels")
+ARRAYS = {  # of a shard: number type and shape
+    "world": (np.integer, PAIRS[:1]),
+    "source": (np.uint8, PAIRS),
+    "edited": (np.uint8, PAIRS),
+    "mask": (np.uint8, PAIRS[:3]),
+    "instruction": (np.str_, PAIRS[:1]),
+    "edit": (np.str_, PAIRS[:1]),
+}
 
 Operators = Callable[[str], Callable[[Tensor], Tensor]]  # an edit's name -> RGB [B,3,H,W] in [0,1] to the same
 
@@ -106,16 +117,39 @@ def _settings(folder: Path, settings: dict) -> None:
     file = folder / "pairs.json"
     if not file.exists():
         write_text(file, json.dumps(settings))
-    elif (there := json.loads(file.read_text(encoding="utf-8"))) | settings != there:
+    elif not isinstance(there := read_json(file), dict) or there | settings != there:
         raise DataError(f"{folder}: holds pairs made with {there}, asked for are {settings}. Choose another folder")
 
 
 def _count(file: Path) -> int:
     """How many pairs a shard holds, 0 where there is none."""
-    if not file.exists():
-        return 0
-    with np.load(file) as shard:
-        return len(shard["world"])
+    return len(_arrays(file, ["world"])["world"]) if file.exists() else 0
+
+
+def _arrays(file: Path, names: Iterable[str]) -> dict[str, ndarray]:
+    """These arrays of a shard. Raises DataError where the file is no archive of arrays, or lacks one."""
+    try:
+        with np.load(file) as shard:
+            lacking = [name for name in names if name not in shard]
+            if not lacking:
+                return {name: shard[name] for name in names}
+            found = ", ".join(shard)
+    except Exception as error:  # numpy, zip and zlib raise their own kinds
+        raise DataError(f"{file}: is no shard of pairs, or is damaged ({type(error).__name__}). Remove it") from error
+    raise DataError(f"{file}: has no '{lacking[0]}', which a shard of pairs needs (found {found or 'nothing'})")
+
+
+def _shard(file: Path, size: tuple[int, ...] | None) -> dict[str, ndarray]:
+    """The arrays of a shard, each with the number type and the shape that `make_pairs` describes. size: height and
+    width of the pairs before it. Raises DataError."""
+    arrays = _arrays(file, ARRAYS)
+    for name, (kind, shape) in ARRAYS.items():
+        array = arrays[name]
+        wanted = (len(arrays["world"]), *(size or arrays["source"].shape[1:3]), 3)[: len(shape)]
+        if not np.issubdtype(array.dtype, kind) or array.shape != wanted or array.size == 0:
+            held = f"{array.dtype} {list(array.shape)}"
+            raise DataError(f"{file}: '{name}' is {held}, expected {kind.__name__} {list(wanted)}: {' x '.join(shape)}")
+    return arrays
 
 
 def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs: Operators | None = None) -> None:
@@ -144,12 +178,12 @@ def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs
 
 def read_pairs(folder: Path) -> dict[str, ndarray]:
     """All pairs of `folder` in the order of their shards, as the arrays that make_pairs describes, in memory
-    (about 115 kB a pair at 128 x 128). Raises DataError where there is none."""
+    (about 115 kB a pair at 128 x 128). Raises DataError where there is none, or a shard is damaged or holds anything
+    else."""
     files = sorted(Path(folder).glob("pairs-*.npz"))
     if not files:
         raise DataError(f"{folder}: no training pairs (pairs-*.npz) in it. Make some with make_pairs")
     shards = []
     for file in files:
-        with np.load(file) as shard:
-            shards.append(dict(shard))
+        shards.append(_shard(file, shards[0]["source"].shape[1:3] if shards else None))
     return {key: np.concatenate([shard.pop(key) for shard in shards]) for key in list(shards[0])}

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from ..errors import PriorError
+
+T = TypeVar("T")
 
 CONFIGS = {
     "unet": "config.json",
@@ -63,14 +66,21 @@ class Folder:
     def instructions(self) -> dict[str, list[str]] | None:
         """What the model was taught, wordings by edit; None where the folder does not say."""
         file = self.path / INSTRUCTIONS
-        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+        if not file.is_file():
+            return None
+        taught = _json(file)
+        texts = [text for words in taught.values() for text in (words if isinstance(words, list) else [None])]
+        if not all(isinstance(text, str) for text in texts):
+            raise PriorError(f"{file}: expected a list of wordings for each edit. Download the folder again.")
+        return taught
 
     def alphas_cumprod(self) -> Tensor:
         """abar_t [T] float64. The betas are the folder's (float32, as trained); their product is taken in float64,
         because rules that divide by 1 - abar_t / abar_{t-1} would see the rounding of a float32 product."""
         from diffusers import DDPMScheduler
 
-        return torch.cumprod(1 - DDPMScheduler.from_config(self.scheduler).betas.double(), dim=0)
+        scheduler = _built(self.path / "scheduler", lambda: DDPMScheduler.from_config(self.scheduler))
+        return torch.cumprod(1 - scheduler.betas.double(), dim=0)
 
 
 def open_folder(path: str, conditioned: bool) -> Folder:
@@ -139,10 +149,31 @@ def _read(root: Path, name: str, file: str) -> dict[str, Any]:
             f"{root}: '{name}/{file}' is missing (folders found: {', '.join(there) or 'none'}). A model folder needs "
             f"{', '.join(CONFIGS)}; give the folder that holds model_index.json."
         )
+    return _json(target)
+
+
+def _json(file: Path) -> dict[str, Any]:
+    """The object in a JSON file. Raises PriorError."""
     try:
-        return json.loads(target.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise PriorError(f"{target}: not valid JSON ({error}). Download the folder again.") from error
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise PriorError(f"{file}: not valid JSON ({_first_line(error)}). Download the folder again.") from error
+    if not isinstance(content, dict):
+        raise PriorError(f"{file}: holds a {type(content).__name__}, expected an object. Download the folder again.")
+    return content
+
+
+def _built(where: Path, build: Callable[[], T]) -> T:
+    """What `build` makes of a config. Raises PriorError."""
+    try:
+        return build()
+    except Exception as error:  # diffusers and transformers have no error of their own for a config that cannot be
+        raise PriorError(f"{where}: its config cannot be used ({_first_line(error)}). Download it again.") from error
+
+
+def _first_line(error: Exception) -> str:
+    """The kind of an error and the first line of what it says."""
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:200]}"
 
 
 def _check_kind(folder: Folder) -> None:
@@ -205,14 +236,19 @@ def check_memory(folder: Folder, dtype: torch.dtype, device: torch.device, *, of
     from transformers import CLIPTextConfig, CLIPTextModel
 
     with torch.device("meta"):  # shapes only
-        text_encoder = CLIPTextModel(CLIPTextConfig.from_dict(folder.text_encoder))
-        visitors = [UNet2DConditionModel.from_config(folder.unet), text_encoder]
-        resident = [] if tiny else [AutoencoderKL.from_config(folder.vae)]
+        visitors = [
+            _built(folder.path / "unet", lambda: UNet2DConditionModel.from_config(folder.unet)),
+            _built(
+                folder.path / "text_encoder",
+                lambda: CLIPTextModel(CLIPTextConfig.from_dict(folder.text_encoder)),
+            ),
+        ]
+        vae = [] if tiny else [_built(folder.path / "vae", lambda: AutoencoderKL.from_config(folder.vae))]
 
     def size(module: nn.Module) -> int:
         return sum(p.numel() for p in module.parameters()) * dtype.itemsize
 
-    need = sum(map(size, resident)) + (max if offload else sum)(map(size, visitors))
+    need = sum(map(size, vae)) + (max if offload else sum)(map(size, visitors))
     free = free_memory(device)
     if need > free:
         raise PriorError(
@@ -233,9 +269,9 @@ def load(kind: type, path: str | Path, subfolder: str | None, dtype: torch.dtype
         options |= {"torch_dtype": dtype, "low_cpu_mem_usage": is_accelerate_available()}
     try:
         model, info = kind.from_pretrained(str(path), output_loading_info=True, **options)
-    except (OSError, ValueError, RuntimeError, KeyError) as error:
+    except Exception as error:  # each way to store weights raises its own kinds
         raise PriorError(
-            f"{where}: cannot be loaded as {kind.__name__}: {str(error).splitlines()[0]} "
+            f"{where}: cannot be loaded as {kind.__name__}: {_first_line(error)} "
             f"Give a complete folder, or an id that the hub or its local cache has."
         ) from error
     if info["missing_keys"]:
@@ -252,10 +288,14 @@ def load_tokenizer(folder: Folder) -> Any:
     """The folder's CLIPTokenizer. Raises PriorError."""
     from transformers import CLIPTokenizer
 
+    where = folder.path / "tokenizer"
+    for file in (where / "vocab.json", where / "merges.txt"):
+        if file.is_file() and not file.stat().st_size:  # with no merges, words would be spelled letter by letter
+            raise PriorError(f"{file}: is empty; download the folder again.")
     try:
         return CLIPTokenizer.from_pretrained(str(folder.path), subfolder="tokenizer")
-    except (OSError, ValueError, TypeError) as error:
+    except Exception as error:  # the library under it raises its own kinds
         raise PriorError(
-            f"{folder.path / 'tokenizer'}: cannot be loaded: {str(error).splitlines()[0]} It needs vocab.json and "
-            f"merges.txt; download the folder again."
+            f"{where}: cannot be loaded: {_first_line(error)} It needs vocab.json and merges.txt; download the folder "
+            "again."
         ) from error
