@@ -56,3 +56,11 @@ def small_disk(tmp_path):
     folder.mkdir()
     with mount(folder, 192 << 10) as disk:
         yield disk
+
+
+@pytest.fixture
+def gsplat_here(monkeypatch):
+    """The backend "gsplat" draws on this machine, whatever it is."""
+    from tests.render.gsplat_on_cpu import install
+
+    install(monkeypatch)

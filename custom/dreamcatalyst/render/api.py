@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,10 +15,9 @@ from ..scene.gaussians import Gaussians
 from .frozen import Frozen
 
 BACKENDS = Registry("rasterizer backend", __package__)
-BACKENDS.add("reference", ".reference:rasterize")
-BACKENDS.add("cpu", ".cpu:rasterize")
-BACKENDS.add("gsplat", ".gsplat:rasterize")
-KEEPS = {"cpu"}  # backends that take `frozen` themselves, for colour alone; others are given all splats in one scene
+BACKENDS.add("reference", ".reference:BACKEND")
+BACKENDS.add("cpu", ".cpu:BACKEND")
+BACKENDS.add("gsplat", ".gsplat:BACKEND")
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,46 @@ class Render:
     radii: Tensor
 
 
+@dataclass(frozen=True)
+class Backend:
+    """One way to draw, and what it can: all who choose a backend ask here.
+
+    draw: as `rasterize`, for splats that `check` lets through. devices, dtypes: what it takes (types of torch.device),
+    empty for any. keeps_frozen: draw takes `frozen` itself, for colour alone, and keeps of it what does not change;
+    others are given all splats in one scene. prepare: makes sure that it can draw at all on this machine, before a run
+    loads anything, and does what takes long; raises SceneError with the remedy where it cannot.
+    """
+
+    name: str
+    draw: Callable[..., Render]
+    devices: tuple[str, ...] = ()
+    dtypes: tuple[torch.dtype, ...] = ()
+    keeps_frozen: bool = False
+    prepare: Callable[[], None] | None = None
+
+    def check(self, device: torch.device, dtype: torch.dtype) -> None:
+        """Raise SceneError where it cannot draw splats of this kind."""
+        if device.type in (self.devices or [device.type]) and dtype in (self.dtypes or [dtype]):
+            return
+        where, kind = (self.devices or [device.type])[0], (self.dtypes or [dtype])[0]
+        raise SceneError(
+            f"rasterize: backend '{self.name}' got {dtype} splats on {device}, expected {kind} on {where}. Convert "
+            f"them with .to('{where}', {kind}), or choose another backend: 'reference' takes any, 'auto' chooses."
+        )
+
+
+def find_backend(name: str, device: torch.device, dtype: torch.dtype = torch.float32) -> Backend:
+    """The backend called `name`, or that which "auto" chooses for splats of this kind: gsplat for those on a GPU, cpu
+    for the others, reference for float64 on the CPU. Raises ConfigError for an unknown name, and SceneError where it
+    cannot draw them."""
+    if name == "auto":
+        on_cpu = device.type == "cpu"
+        name = ("reference" if dtype == torch.float64 else "cpu") if on_cpu else "gsplat"
+    backend = BACKENDS.get(name, "renderer.backend")
+    backend.check(device, dtype)
+    return backend
+
+
 def rasterize(
     scene: Gaussians,
     cameras: Cameras,
@@ -60,7 +100,8 @@ def rasterize(
     backend: reference | cpu | gsplat, or auto (gsplat for splats on a GPU, cpu otherwise; float64 takes reference).
     frozen: F further splats that stand before those of `scene` and take no derivative; `features` is then [F+N,F'], and
     `means2d` and `radii` are those of `scene` alone. What the backend keeps of them makes the next call faster.
-    Differentiable in every parameter of `scene`, in `background` and in `features`; not in `cameras`.
+    Differentiable in every parameter of `scene`, in `background` and in `features`; not in `cameras`. Autocast is off
+    inside, so that positions keep their digits; backward belongs outside of it, too, as everywhere in torch.
     Source: Kerbl et al. 2023, sections 4-6. Raises SceneError where arguments disagree in size, dtype or device.
     """
     if background is None:
@@ -75,24 +116,23 @@ def rasterize(
         raise SceneError(f"rasterize: features have shape {tuple(features.shape)}, expected ({rows}, F)")
     if sh_degree is not None and not 0 <= sh_degree <= scene.sh_degree:
         raise SceneError(f"rasterize: sh_degree {sh_degree} asked of splats that have degree {scene.sh_degree}")
-    if backend == "auto":
-        on_cpu = scene.means.device.type == "cpu"
-        backend = ("reference" if scene.means.dtype == torch.float64 else "cpu") if on_cpu else "gsplat"
-    draw = BACKENDS.get(backend, "renderer.backend")
-    cameras = cameras.to(scene.means.device, scene.means.dtype)
-    options = dict(
-        background=background.to(scene.means),
-        sh_degree=scene.sh_degree if sh_degree is None else sh_degree,
-        features=features,
-        depth=depth,
-        antialiased=antialiased,
-    )
-    if frozen is None:
-        return draw(scene, cameras, **options)
-    if backend in KEEPS and features is None and not depth:
-        return draw(scene, cameras, **options, frozen=frozen)
-    render = draw(Gaussians.cat([replace(part, extra={}) for part in (frozen.scene, scene)]), cameras, **options)
-    return replace(render, means2d=_tail(render.means2d, len(frozen)), radii=render.radii[:, len(frozen) :])
+    drawer = find_backend(backend, scene.means.device, scene.means.dtype)
+    with torch.autocast(scene.means.device.type, enabled=False):
+        cameras = cameras.to(scene.means.device, scene.means.dtype)
+        options = dict(
+            background=background.to(scene.means),
+            sh_degree=scene.sh_degree if sh_degree is None else sh_degree,
+            features=None if features is None else features.to(scene.means),
+            depth=depth,
+            antialiased=antialiased,
+        )
+        if frozen is None:
+            return drawer.draw(scene, cameras, **options)
+        if drawer.keeps_frozen and features is None and not depth:
+            return drawer.draw(scene, cameras, **options, frozen=frozen)
+        whole = Gaussians.cat([replace(part, extra={}) for part in (frozen.scene, scene)])
+        render = drawer.draw(whole, cameras, **options)
+        return replace(render, means2d=_tail(render.means2d, len(frozen)), radii=render.radii[:, len(frozen) :])
 
 
 def _check(scene: Gaussians, frozen: Gaussians) -> None:

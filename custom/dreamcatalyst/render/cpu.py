@@ -15,10 +15,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ..data.camera import Cameras
-from ..errors import SceneError
 from ..scene.gaussians import Gaussians
 from . import cpu_composite, cpu_frozen, cpu_project, cpu_sh, cpu_tiles
-from .api import Render
+from .api import Backend, Render
 from .frozen import Frozen
 
 
@@ -33,15 +32,9 @@ def rasterize(
     antialiased: bool,
     frozen: Frozen | None = None,
 ) -> Render:
-    """Draw `scene`; arguments and result as in `api.rasterize`, but `frozen` excludes features and depth. Raises
-    SceneError for other than float32 on the CPU."""
-    if scene.means.dtype != torch.float32 or scene.means.device.type != "cpu":
-        raise SceneError(
-            f"rasterize: backend 'cpu' got {scene.means.dtype} splats on {scene.means.device}, expected torch.float32 "
-            "on cpu. Convert them with .to('cpu', torch.float32), or choose backend 'reference', which takes any."
-        )
+    """Draw `scene`; arguments and result as in `api.rasterize`, but `frozen` excludes features and depth."""
     means2d, conics, colors, opacities, depths, radii = _splats(scene, cameras, sh_degree, antialiased)
-    extras = [] if features is None else [features.to(colors).expand(len(cameras), -1, -1)]
+    extras = [] if features is None else [features.expand(len(cameras), -1, -1)]
     extras += [depths[..., None]] if depth else []
     extras = torch.cat(extras, dim=-1) if extras else None
 
@@ -199,3 +192,6 @@ class Composite(torch.autograd.Function):
         out = [torch.from_numpy(g) for g in grads]
         g_background = None if g_background is None else torch.from_numpy(g_background)
         return *out[:4], out[4] if channels else None, g_background, *[None] * 5
+
+
+BACKEND = Backend("cpu", rasterize, devices=("cpu",), dtypes=(torch.float32,), keeps_frozen=True)

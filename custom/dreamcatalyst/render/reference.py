@@ -12,7 +12,7 @@ from torch import Tensor
 from ..data.camera import Cameras
 from ..scene.gaussians import Gaussians
 from . import sh
-from .api import Render
+from .api import Backend, Render
 from .projection import project, radii
 from .thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
@@ -35,7 +35,7 @@ def rasterize(
         opacities = opacities * splats.compensation
     views, n = opacities.shape
     channels = [rgb, splats.depths[..., None]]
-    channels += [] if features is None else [features.to(rgb).expand(views, -1, -1)]
+    channels += [] if features is None else [features.expand(views, -1, -1)]
     channels = torch.cat(channels, dim=-1)
     radius = radii(splats, opacities, cameras)
 
@@ -76,3 +76,6 @@ def blend(means2d: Tensor, covs2d: Tensor, dets: Tensor, opacities: Tensor, came
     after = torch.cumprod(1 - alpha, dim=-1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=-1)[:, : after.shape[1]]
     return alpha * before
+
+
+BACKEND = Backend("reference", rasterize)

@@ -15,7 +15,8 @@ class Clock:
 
     A stage inside "logging" is logging, too, whatever it is called: what a report draws is the report's. wait: called
     at each change of stage, so that a device that works on its own is done with what it was asked for; without it such
-    a device's work is booked on the stage that first needs the result.
+    a device's work would be booked on the stage that first needs a result. A step waits for its numbers more often than
+    that anyway (losses, norms, what is not finite), so it costs little.
     """
 
     def __init__(self, wait: Callable[[], None] | None = None):

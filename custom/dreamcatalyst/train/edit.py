@@ -130,7 +130,6 @@ class EditSystem(SplatSystem):
         self._regions: dict[int, Tensor | None] = {}
 
     def setup(self, stage: str) -> None:
-        self.prepare()
         super().setup(stage)
         if stage == "fit":
             write_ply(self.save_path("source.ply"), self.source.to("cpu"), origin=self.origin)
@@ -141,6 +140,7 @@ class EditSystem(SplatSystem):
 
     def prepare(self) -> None:
         """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""
+        super().prepare()
         if self.guidance is None:
             words: PromptConfig = self.part["prompt_processor"]
             self.guidance = Guidance(self.part["guidance"], words.prompt, words.source_prompt, device=self.root_device)

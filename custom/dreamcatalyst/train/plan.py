@@ -133,6 +133,11 @@ class Draft:
             self.leave_out("frozen splats", "all splats are editable")
             return
         self.add("frozen splats", "never change: no gradient, no moment, no anchor", scene_bytes(splats.frozen))
+        backend = self.system.backend
+        if not backend.keeps_frozen:
+            why = f"backend '{backend.name}' draws all splats in every step"
+            self.leave_out("renders of frozen splats", why)
+            return
         views = len(self.system.capture.views)
         most = min(self.system.part["renderer"].cache_mib * 2**20, views * view_bytes(len(splats.frozen), pixels))
         self.add("renders of frozen splats", "kept on the CPU, at most", most)

@@ -34,7 +34,7 @@ class Record:
     def begin(self, system: SplatSystem) -> None:
         """Start the clock, and of a new run, add the row of step 0."""
         system.picture(self.views(system)[0])  # the first picture may compile the renderer: no part of any run
-        self.clock.wait = waiter(system.root_device) if self.config.synchronize else None
+        self.clock.wait = waiter(system.root_device)
         self.clock.start()
         if system.true_global_step == 0:
             self.add(system, 0)

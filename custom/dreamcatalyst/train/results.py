@@ -28,7 +28,6 @@ class ReportConfig:
     every: int = 50  # steps between two rows of report/error.csv; 0: first and last step only
     views: int = 4  # held-out views that each row is measured on
     overhead: float = 0.025  # rows have their errors measured as long as rows take this share of the time at most
-    synchronize: bool = False  # the clock waits for the device between stages: exact on a GPU, and a little slower
     pictures: int = 8  # comparisons written at the end
     video_frames: int = 72  # 0: no video
     video_fps: int = 24

@@ -16,7 +16,7 @@ from ..data.camera import Cameras
 from ..data.views import Capture
 from ..diffusion.noise import keyed_generator
 from ..errors import ConfigError, NumericalError, SceneError, choose
-from ..render.api import Render, rasterize
+from ..render.api import Backend, Render, find_backend, rasterize
 from ..render.frozen import Frozen
 from ..report.clip import ClipJudge
 from ..report.clock import Clock
@@ -108,7 +108,19 @@ class SplatSystem(System):
         self._cap_announced = False
         self._kept_at: int | None = None  # the step whose splats are in last.ply, of those that this process trained
 
+    @property
+    def backend(self) -> Backend:
+        """What draws this run. Raises ConfigError and SceneError as `find_backend`."""
+        return find_backend(self.part["renderer"].backend, self.root_device)
+
+    def prepare(self) -> None:
+        """What is made sure of before anything is loaded: that this machine can draw."""
+        prepare = self.backend.prepare
+        if prepare is not None:
+            prepare()
+
     def setup(self, stage: str) -> None:
+        self.prepare()
         if self.splats is None:
             self.splats = self.make_splats(self.first_scene().to(self.root_device))
             self.splats.state.update(screen_statistics(self.splats))
@@ -245,7 +257,7 @@ class SplatSystem(System):
         require_finite("loss", loss=loss)
         render.means2d.retain_grad()
         optimizer.zero_grad()
-        with stage("backward"):
+        with stage("backward"), torch.autocast(loss.device.type, enabled=False):  # it is for what goes forward only
             self.manual_backward(loss)
             norms = {} if self._scaler is not None else gradient_norms(self.splats.parameters)
         observe(self.splats, render, 1.0 if self._scaler is None else float(self._scaler.get_scale()))
