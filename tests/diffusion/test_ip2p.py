@@ -230,6 +230,7 @@ def test_too_little_memory_is_refused_before_weights_are_read(models, monkeypatc
         ({"dtype": "fp61"}, "prior.dtype.*Did you mean 'fp16'"),
         ({"latents": "mean"}, "prior.latents: unknown kind of latents 'mean'"),
         ({"latents": "sample", "autoencoder": "taesd"}, "has no posterior"),
+        ({"latents": "independent", "autoencoder": "taesd"}, "has no posterior"),
         ({"max_rows": 0}, "prior.max_rows: got 0"),
     ],
 )
@@ -273,6 +274,23 @@ def test_sampled_latents_share_their_noise(models, prior):
     assert torch.equal(sampler.encode(source), sampler.encode(source))
     given = noise(1, 4, 8, 8, seed=5)
     torch.testing.assert_close(prior.encode(source, given), (posterior.mode() + posterior.std * given)[:1] * SCALE)
+
+
+def test_draws_of_a_posterior_have_its_deviation(prior):
+    image = images(2, 3, 61, 50)
+    posterior = prior.autoencoder.vae.encode(prior.autoencoder._pixels(image)).latent_dist
+    torch.testing.assert_close(prior.deviation(image), posterior.std * SCALE)
+    shape = prior.latent_shape(image)
+    assert shape == (4, 8, 7) == tuple(prior.encode(image).shape[1:])
+    given = noise(2, *shape)
+    torch.testing.assert_close(prior.encode(image, given) - prior.encode(image), prior.deviation(image) * given)
+
+
+def test_the_condition_of_the_published_nerf_release_is_of_the_image_as_it_is(models, prior):
+    image = images(1, 3, 64, 64)
+    other = InstructPix2Pix(Ip2pConfig(str(models["ip2p"]), condition_unit_range=True))
+    torch.testing.assert_close(other.condition(image), prior.autoencoder.vae.encode(image).latent_dist.mode())
+    torch.testing.assert_close(other.encode(image), prior.encode(image))  # latents are not concerned
 
 
 @pytest.mark.parametrize("h, w", [(64, 64), (61, 64), (64, 57), (75, 99), (3, 5)])

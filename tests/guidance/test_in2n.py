@@ -45,6 +45,14 @@ def test_with_zero_only_first_visits_edit():
     assert not views.due(4, 0) and not views.due(4, 10)
 
 
+def test_later_edits_take_place_between_two_steps():
+    """First visits are edited at any time (GaussianEditor: begin < step < until)."""
+    views = EditedViews(10, 0.02, 0.98, begin=20, until=50)
+    assert views.due(4, 0) and views.due(4, 60)
+    views.put(4, picture(0))
+    assert [step for step in range(0, 80) if views.due(4, step)] == [30, 40]
+
+
 def test_the_loss_is_the_mean_absolute_difference_from_the_kept_edit():
     made = guidance()
     visit(made, 0, 1)
@@ -101,6 +109,8 @@ def test_a_resumed_run_compares_with_the_same_pictures(tmp_path):
 def test_options_that_cannot_be_are_named():
     with pytest.raises(ConfigError, match="per_editing_step: got -1"):
         guidance(per_editing_step=-1)
+    with pytest.raises(ConfigError, match="edit_begin_step 9 and edit_until_step 3"):
+        guidance(edit_begin_step=9, edit_until_step=3)
     with pytest.raises(ConfigError, match="edit_min_percent 0.5 and edit_max_percent 0.2"):
         guidance(edit_min_percent=0.5, edit_max_percent=0.2)
 

@@ -21,6 +21,32 @@ def folder(tmp_path_factory):
     return make_model(tmp_path_factory.mktemp("models") / "ip2p")
 
 
+def test_independent_latents_are_drawn_anew_at_every_step_source_and_edit_apart(folder, monkeypatch):
+    """As the published codes draw them; a function of seed, step and view, so that a resumed run draws the same."""
+    from dreamcatalyst.guidance import guidance as module
+
+    prior = {"path": str(folder), "latents": "independent"}
+    made = Guidance(GuidanceConfig(prior_type="ip2p", prior=prior, seed=SEED), PROMPT)
+    image, seen = torch.rand(1, 40, 32, 3, generator=torch.Generator().manual_seed(1)), {}
+
+    def gradient(prior, rule, x, x_src, **others):
+        seen[step] = [(z - mode) / deviation for z in (x, x_src)]
+        return torch.zeros_like(x)
+
+    monkeypatch.setattr(module, "distillation_gradient", gradient)
+    pixels = image.permute(0, 3, 1, 2)
+    mode, deviation = made.prior.encode(pixels), made.prior.deviation(pixels)
+    for step in (*range(30), 0):
+        before = seen.get(step)
+        made.step(image, image, [VIEW], step, 100)
+        if before is not None:
+            assert all(torch.equal(one, other) for one, other in zip(before, seen[step], strict=True))
+    edited, source = (torch.cat(draws).flatten(1) for draws in zip(*seen.values(), strict=True))
+    assert edited.std().item() == pytest.approx(1, abs=0.06) and source.std().item() == pytest.approx(1, abs=0.06)
+    both = torch.corrcoef(torch.stack([edited.flatten(), source.flatten(), edited.roll(1, 0).flatten()]))
+    assert (both - torch.eye(3)).abs().max() < 0.1
+
+
 @pytest.fixture(scope="module")
 def pipeline(folder):
     from diffusers import StableDiffusionInstructPix2PixPipeline

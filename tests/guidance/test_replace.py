@@ -58,6 +58,19 @@ def flow(noisy, abar, mean, spread):
     return mean + spread * (noisy - abar**0.5 * mean) / (abar * spread**2 + 1 - abar) ** 0.5
 
 
+def test_ddim_ends_at_the_noise_of_timestep_zero_where_asked_to(world):
+    """x = sqrt(abar_0) x_0 + sqrt(1 - abar_0) e of the last prediction, in place of x_0."""
+    options = dict(image=world.condition, text=world.text, timestep=600, steps=5)
+    clean = edit_image(world.prior, world.x, world.noise, **options)
+    prior = Recording(world.prior)
+    ended = edit_image(prior, world.x, world.noise, set_alpha_to_one=False, **options)
+    t, noisy, _ = prior.asked[-1]
+    abar, end = (prior.alphas_cumprod[i].item() for i in (t, 0))
+    eps = (noisy - math.sqrt(abar) * clean) / math.sqrt(1 - abar)
+    assert torch.allclose(ended, math.sqrt(end) * clean + math.sqrt(1 - end) * eps, rtol=0, atol=1e-12)
+    assert not torch.allclose(ended, clean, atol=1e-3)
+
+
 @pytest.mark.parametrize("name, text", [("instruction", True), ("null", False)])
 def test_ddim_converges_to_the_flow(world, name, text):
     """At scales 1, 1 the prediction is that of one Gaussian, whose flow is known: first order in the step."""

@@ -21,6 +21,18 @@ def run(policy, steps, **options):
     return [Schedule(policy, **options).timestep(step, steps, ABAR) for step in range(steps)]
 
 
+def test_a_schedule_of_its_own_length_is_cut_by_a_shorter_run():
+    """As published: i = floor(350 (K - k) / K + 100) of 500 with K = 1500 also where 1200 steps are run."""
+    schedule = Schedule("decreasing", 0.2, 0.9, steps=1500)
+    for k in (0, 1, 600, 1199):
+        published = 2 * math.floor(350 * (1500 - k) / 1500 + 100) + 1
+        assert abs(schedule.timestep(k, 1200, ABAR) - published) <= 2  # ours ends at 0.2 with its last step
+    assert schedule.timestep(1199, 1200, ABAR) > 340 and schedule.timestep(1499, 1500, ABAR) == 201
+    assert schedule.timestep(4000, 5000, ABAR) == 201  # where the published index turns negative
+    with pytest.raises(ConfigError, match="schedule_steps: got 0"):
+        Schedule(steps=0)
+
+
 @pytest.mark.parametrize("steps", LENGTHS)
 def test_decreasing_goes_from_901_to_201(steps):
     taken = run("decreasing", steps)

@@ -38,12 +38,14 @@ class Prior(ABC):
     alphas_cumprod [T] float64 on the CPU: abar_t of timestep index t = 0..T-1 (Ho et al. 2020).
     takes_image: whether the image condition means anything (False for text-to-image models).
     exact: whether the edit of an image is known in closed form (`known_edit`).
+    draws_latents: whether latents are drawn from a posterior at every use, with noise that the caller gives.
     instructions: all that the prior was taught, wordings by edit; None where it is open to any.
     """
 
     alphas_cumprod: Tensor
     takes_image: bool = True
     exact: bool = False
+    draws_latents: bool = False
     instructions: Mapping[str, Sequence[str]] | None = None
 
     @property
@@ -52,8 +54,17 @@ class Prior(ABC):
         return 0
 
     @abstractmethod
-    def encode(self, images: Tensor) -> Tensor:
-        """Images to scaled latents, differentiable in `images` [B,3,H,W] in [0,1]."""
+    def encode(self, images: Tensor, noise: Tensor | None = None) -> Tensor:
+        """Images to scaled latents, differentiable in `images` [B,3,H,W] in [0,1]: the mode of their posterior; with
+        noise [B,C,h,w], standard normal, a draw of it. A prior without a posterior takes no notice of the noise."""
+
+    def latent_shape(self, images: Tensor) -> tuple[int, ...]:
+        """[C,h,w] of the latents of images [B,3,H,W]."""
+        return tuple(images.shape[1:])
+
+    def deviation(self, images: Tensor) -> Tensor:
+        """The standard deviation of the posterior of images [B,3,H,W], [B,C,h,w] in units of latents, without graph."""
+        return torch.zeros(len(images), *self.latent_shape(images), dtype=images.dtype, device=images.device)
 
     @abstractmethod
     def decode(self, latents: Tensor) -> Tensor:

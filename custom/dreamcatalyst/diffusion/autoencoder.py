@@ -25,8 +25,11 @@ class Autoencoder:
     `decode` crops there: no pixel ever moves.
     """
 
-    def __init__(self, vae: nn.Module, folder: Folder, *, sample: bool = False, seed: int = 0):
+    def __init__(
+        self, vae: nn.Module, folder: Folder, *, sample: bool = False, seed: int = 0, unit_condition: bool = False
+    ):
         self.vae, self.factor, self.sample, self.seed = vae, folder.factor, sample, seed
+        self.unit_condition = unit_condition
         self.scale, self.shift = folder.scaling_factor, folder.shift_factor
         self.tiny = type(vae).__name__ == "AutoencoderTiny"
         self._encoder = vae.encode
@@ -55,9 +58,18 @@ class Autoencoder:
 
     @torch.no_grad()
     def condition(self, images: Tensor) -> Tensor:
-        """The posterior's mode of images [B,3,H,W] in [0,1], unscaled, in the model's precision, without graph."""
-        encoded = self.vae.encode(self._pixels(images).to(self.vae.dtype))
+        """The posterior's mode of images [B,3,H,W] in [0,1], unscaled, in the model's precision, without graph.
+        unit_condition: of these numbers as they are, not brought to [-1,1]."""
+        pixels = self._pixels(images)
+        encoded = self.vae.encode((pixels / 2 + 0.5 if self.unit_condition else pixels).to(self.vae.dtype))
         return encoded.latents / self.scale + self.shift if self.tiny else encoded.latent_dist.mode()
+
+    @torch.no_grad()
+    def deviation(self, images: Tensor) -> Tensor:
+        """The posterior's standard deviation of images [B,3,H,W] in [0,1], in units of scaled latents, without graph;
+        not for a tiny autoencoder."""
+        posterior = self.vae.encode(self._pixels(images).to(self.vae.dtype)).latent_dist
+        return (posterior.std * self.scale).to(images.dtype)
 
     @torch.no_grad()
     def decode(self, latents: Tensor, size: tuple[int, int] | None = None) -> Tensor:

@@ -75,7 +75,7 @@ class ClosedForm(Prior):
         self.config = config or ClosedFormConfig()
         self.alphas_cumprod = stable_diffusion_schedule() if alphas_cumprod is None else alphas_cumprod
 
-    def encode(self, images: Tensor) -> Tensor:
+    def encode(self, images: Tensor, noise: Tensor | None = None) -> Tensor:
         return 2.0 * images - 1.0
 
     @torch.no_grad()

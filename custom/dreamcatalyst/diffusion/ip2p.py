@@ -36,7 +36,12 @@ class Ip2pConfig:
         gradient through a half-precision encoder is kept in range by itself, so no loss scaling is needed.
     autoencoder: null for the folder's, or folder or id of an AutoencoderTiny (madebyollin/taesd): cheaper, blurrier
         (measured: 0.7 of the time, 0.31 of the memory; encoding alone an eighth of its time).
-    latents: mode of the posterior, or sample: both branches, and every view of a size, with the same noise of `seed`.
+    latents: mode of the posterior; sample: both branches, and every view of a size, with the same noise of `seed`; or
+        independent: drawn anew at every step, source and edit apart, as all published codes do. The mode is the default
+        because independent draws differ by sqrt(2) deviations where nothing was edited, which the identity term takes
+        for an edit, and no draw says more of an image than the mode.
+    condition_unit_range: the image condition is encoded from [0,1] for [-1,1], off the range that the autoencoder
+        knows: what the published NeRF release does, for its figures.
     freeu: see FreeUConfig.
     slicing: the autoencoder takes a batch one image at a time. Same result; saves memory for batches only
         (measured with one view per step: none).
@@ -59,6 +64,7 @@ class Ip2pConfig:
     dtype: str = "fp32"
     autoencoder: str | None = None
     latents: str = "mode"
+    condition_unit_range: bool = False
     seed: int = 0
     freeu: FreeUConfig = field(default_factory=FreeUConfig)
     slicing: bool = False
@@ -71,9 +77,11 @@ class Ip2pConfig:
 
     def __post_init__(self) -> None:
         choose("precision", self.dtype, DTYPES, "prior.dtype")
-        choose("kind of latents", self.latents, ("mode", "sample"), "prior.latents")
-        if self.latents == "sample" and self.autoencoder is not None:
-            raise ConfigError("prior.latents=sample: a tiny autoencoder has no posterior to sample; set latents=mode")
+        choose("kind of latents", self.latents, ("mode", "sample", "independent"), "prior.latents")
+        if self.latents != "mode" and self.autoencoder is not None:
+            raise ConfigError(
+                f"prior.latents={self.latents}: a tiny autoencoder has no posterior to sample; set latents=mode"
+            )
         if self.max_rows is not None and self.max_rows < 1:
             raise ConfigError(f"prior.max_rows: got {self.max_rows}, expected at least 1, or null for no limit")
 
@@ -103,7 +111,14 @@ class LatentDiffusion(Prior):
         self.text_encoder = load(CLIPTextModel, folder.path, "text_encoder", self.dtype).to(home)
         self.unet = load(UNet2DConditionModel, folder.path, "unet", self.dtype).to(home)
         vae = load_autoencoder(folder, config.autoencoder, self.dtype).to(self.device)
-        self.autoencoder = Autoencoder(vae, folder, sample=config.latents == "sample", seed=config.seed)
+        self.autoencoder = Autoencoder(
+            vae,
+            folder,
+            sample=config.latents == "sample",
+            seed=config.seed,
+            unit_condition=config.condition_unit_range,
+        )
+        self.draws_latents = config.latents == "independent"
         if config.checkpointing:
             self.autoencoder.enable_checkpointing()
         self.freeu = FreeU(self.unet, config.freeu).install()
@@ -136,6 +151,14 @@ class LatentDiffusion(Prior):
         """
         with self._own_precision():
             return self.autoencoder.encode(images, noise)
+
+    def latent_shape(self, images: Tensor) -> tuple[int, ...]:
+        height, width = (-(-side // self.autoencoder.factor) for side in images.shape[-2:])
+        return self.latent_channels, height, width
+
+    def deviation(self, images: Tensor) -> Tensor:
+        with self._own_precision():
+            return self.autoencoder.deviation(images)
 
     def decode(self, latents: Tensor, size: tuple[int, int] | None = None) -> Tensor:
         """Scaled latents [B,C,h,w] to images [B,3,8h,8w] in [0,1], without graph. size (H, W): of the image that was

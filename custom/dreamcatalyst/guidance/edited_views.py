@@ -18,10 +18,13 @@ class EditedViews:
     """The edited picture of every view that was visited so far, in 8 bits, like the photographs that it stands in for.
 
     every: a view is edited at its first visit, and again where it is visited at a step that is a multiple of `every`
-    (0: never again). lowest, highest: limits of the noise level of an edit, fractions of the prior's T.
+    (0: never again), after step `begin` and before step `until` (None: to the end). lowest, highest: limits of the
+    noise level of an edit, fractions of the prior's T.
     """
 
-    def __init__(self, every: int, lowest: float, highest: float, seed: int = 0):
+    def __init__(
+        self, every: int, lowest: float, highest: float, seed: int = 0, begin: int = 0, until: int | None = None
+    ):
         if every < 0:
             raise ConfigError(f"system.guidance.per_editing_step: got {every}, expected 0 (first visits only) or more")
         if not 0.0 <= lowest <= highest < 1.0:
@@ -29,12 +32,19 @@ class EditedViews:
                 f"system.guidance: edit_min_percent {lowest} and edit_max_percent {highest} must be fractions with "
                 "0 <= min <= max < 1"
             )
+        if begin < 0 or (until is not None and until < begin):
+            raise ConfigError(
+                f"system.guidance: edit_begin_step {begin} and edit_until_step {until} must be steps with "
+                "0 <= begin <= until, or until null"
+            )
         self.every, self.limits, self.seed = every, (lowest, highest), seed
+        self.begin, self.until = begin, until
         self._images: dict[int, Tensor] = {}
 
     def due(self, view: int, step: int) -> bool:
         """Whether the visit of `view` at `step` makes a new edit."""
-        return view not in self._images or (self.every > 0 and step % self.every == 0)
+        again = self.every > 0 and step % self.every == 0
+        return view not in self._images or (again and self.begin < step and (self.until is None or step < self.until))
 
     def timestep(self, view: int, step: int, train_steps: int) -> int:
         """The noise level of that edit, even between the limits, a pure function of (seed, step, view)."""

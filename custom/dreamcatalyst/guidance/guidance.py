@@ -13,7 +13,7 @@ from torch import Tensor
 from ..cache import ByteCache
 from ..config import parse
 from ..diffusion.api import PRIORS, Prior
-from ..diffusion.noise import keyed_noise
+from ..diffusion.noise import keyed_generator, keyed_noise
 from ..errors import PriorError, choose
 from .distill import check_prior, distillation_gradient, distillation_loss
 from .edited_views import EditedViews
@@ -42,11 +42,15 @@ class GuidanceConfig:
     guidance_scale: float = 7.5  # w_y, of the instruction
     condition_scale: float = 1.5  # w_I, of the image
     timesteps: str | None = None  # policy (guidance/timesteps.py); null: the rule's own
+    schedule_steps: int | None = None  # that the policy goes over, however long the run is; null: the run's
     reduction: str = "mean"  # of the loss over latent elements: mean | sum
     min_step_percent: float | None = None  # lowest noise level, a fraction of T; null: the policy's (decreasing 0.2)
     max_step_percent: float | None = None  # highest; null: the policy's (decreasing 0.9)
     diffusion_steps: int = 20  # of the edits of single images that in2n makes
+    set_alpha_to_one: bool = True  # these edits end without noise; false: with that of timestep 0, as published
     per_editing_step: int = 10  # in2n: visits at its multiples edit the view anew; 0: only first visits edit
+    edit_begin_step: int = 0  # in2n: these edits anew take place after this step
+    edit_until_step: int | None = None  # and before this one; null: to the end
     edit_min_percent: float = 0.02  # in2n: limits of the noise level of an edit, fractions of T
     edit_max_percent: float = 0.98
     noise: str = "independent"  # alternating: e and -e on a view's visits in turn; paired: both in each step
@@ -88,7 +92,7 @@ def chosen_prior(config: GuidanceConfig) -> tuple[type[Prior], Any]:
 def chosen_schedule(config: GuidanceConfig, rule: Rule) -> Schedule:
     """The timesteps of a run. Raises ConfigError."""
     policy = config.timesteps or rule.timesteps
-    return Schedule(policy, lowest=config.min_step_percent, highest=config.max_step_percent, seed=config.seed)
+    return Schedule(policy, config.min_step_percent, config.max_step_percent, config.seed, config.schedule_steps)
 
 
 class Guidance:
@@ -119,8 +123,15 @@ class Guidance:
         self.text = self.prior.embed([prompt])[0]
         compared = source_prompt if self.rule.reference == SOURCE else ""  # other rules never look at it
         self.source_text = self.prior.embed([compared])[0] if compared else None
-        self.edits = EditedViews(config.per_editing_step, config.edit_min_percent, config.edit_max_percent, config.seed)
-        self._views = ByteCache(VIEW_BYTES)
+        self.edits = EditedViews(
+            config.per_editing_step,
+            config.edit_min_percent,
+            config.edit_max_percent,
+            config.seed,
+            config.edit_begin_step,
+            config.edit_until_step,
+        )
+        self._views, self._deviations = ByteCache(VIEW_BYTES), ByteCache(VIEW_BYTES)
         self.stage: Callable[[str], AbstractContextManager] = nullcontext  # around "encode" and "unet": for a clock
 
     @property
@@ -141,14 +152,15 @@ class Guidance:
 
     @torch.no_grad()
     def view(self, source: Tensor, index: int) -> tuple[Tensor, Any]:
-        """Latents [1,C,h,w] and condition of a view's source render [H,W,3]; computed once for each `index`, as
-        long as there is room (1 GiB)."""
+        """Latents [1,C,h,w] (the posterior's mode, where the prior draws them at every use) and condition of a view's
+        source render [H,W,3]; computed once for each `index`, as long as there is room (1 GiB)."""
         image = source.permute(2, 0, 1)[None]
         return self._views.get(index, lambda: (self.prior.encode(image), self.prior.condition(image)))
 
     def forget_views(self) -> None:
         """Encode source views anew: the source is drawn otherwise from here on."""
         self._views.clear()
+        self._deviations.clear()
 
     def reduced(self, loss: Tensor) -> Tensor:
         """Per-element terms [B,...] in the config's reduction, in balance with the rule's loss: their mean, or their
@@ -173,8 +185,8 @@ class Guidance:
         if self.rule.delivers != "gradient":
             return self._compare(rgb, sources, index, step)
         with self.stage("encode"):
-            x_src, condition = self._sources(sources, index)
-            x = self.prior.encode(rgb.permute(0, 3, 1, 2))
+            x_src, condition = self._sources(sources, index, step)
+            x = self._encode(rgb, index, step)
         timestep = self.schedule.timestep(step, max_steps, self.prior.alphas_cumprod)
         noise, latents = self._step_noise(x, index, step, visits), x.detach()
         twice = len(noise) // len(latents) == 2
@@ -199,13 +211,34 @@ class Guidance:
             gradient = (gradient[: len(x)] + gradient[len(x) :]) / 2
         return Step(distillation_loss(x, gradient, self.config.reduction), timestep, gradient)
 
-    def _sources(self, sources: Tensor | None, index: Sequence[int]) -> tuple[Tensor | None, Any]:
+    def _encode(self, images: Tensor, index: Sequence[int], step: int) -> Tensor:
+        """Latents [B,C,h,w] of renders [B,H,W,3], with a graph."""
+        images = images.permute(0, 3, 1, 2)
+        if not self.prior.draws_latents:
+            return self.prior.encode(images)
+        noise = [self._posterior_noise("edited", i, step, self.prior.latent_shape(images)) for i in index]
+        return self.prior.encode(images, torch.stack(noise).to(images.device))
+
+    @torch.no_grad()
+    def _source_latents(self, source: Tensor, index: int, step: int) -> Tensor:
+        """Latents [1,C,h,w] of a view's source render [H,W,3], of its posterior where the prior draws them."""
+        mode = self.view(source, index)[0]
+        if not self.prior.draws_latents:
+            return mode
+        deviation = self._deviations.get(index, lambda: self.prior.deviation(source.permute(2, 0, 1)[None]))
+        return mode + deviation * self._posterior_noise("source", index, step, mode.shape[1:]).to(mode)
+
+    def _posterior_noise(self, branch: str, index: int, step: int, shape: Sequence[int]) -> Tensor:
+        generator = keyed_generator(self.config.seed, "posterior", branch, step, index)
+        return torch.randn(tuple(shape), generator=generator)
+
+    def _sources(self, sources: Tensor | None, index: Sequence[int], step: int) -> tuple[Tensor | None, Any]:
         if sources is None:
             return None, None
-        views = [self.view(source, i) for source, i in zip(sources, index, strict=True)]
-        if len(views) == 1:
-            return views[0]
-        return torch.cat([latents for latents, _ in views]), self.prior.stack([c for _, c in views])
+        views = list(zip(sources, index, strict=True))
+        latents = [self._source_latents(source, i, step) for source, i in views]
+        conditions = [self.view(source, i)[1] for source, i in views]
+        return (latents[0], conditions[0]) if len(views) == 1 else (torch.cat(latents), self.prior.stack(conditions))
 
     def _noise(self, latents: Tensor, index: Sequence[int], step: int) -> Tensor:
         shape, dtype, device = latents.shape[1:], latents.dtype, latents.device
@@ -244,7 +277,7 @@ class Guidance:
             return self.known_edit(source, index)
         if self.rule.delivers == "edit":
             return self.edit(render, source, index, step)
-        x_src, condition = self.view(source, index)
+        x_src, condition = self._source_latents(source, index, step), self.view(source, index)[1]
         timesteps = self.sampler_timesteps
         edited = sample_rule(
             self.prior,
@@ -264,7 +297,7 @@ class Guidance:
     def edit(self, render: Tensor, source: Tensor, index: int, step: int) -> Tensor:
         """Dataset update: the prior's edit of a render [H,W,3], noised to a level that is drawn, and conditioned on the
         source render of the view: [H,W,3] in [0,1]."""
-        latents = self.prior.encode(render.permute(2, 0, 1)[None])
+        latents = self._encode(render[None], [index], step)
         timestep = self.edits.timestep(index, step, len(self.prior.alphas_cumprod))
         noise = self._noise(latents, [index], step)
         return self._edit_image(source, index, latents, noise, timestep=timestep, steps=self.config.diffusion_steps)
@@ -276,6 +309,7 @@ class Guidance:
             noise,
             image=self.view(source, index)[1],
             image_guidance_scale=self.config.condition_scale,
+            set_alpha_to_one=self.config.set_alpha_to_one,
             **{"text": self.text, "guidance_scale": self.config.guidance_scale, **options},
         )
         return self._picture(edited, source)

@@ -58,11 +58,15 @@ class HostConfig:
     guidance_scale: float = 7.5  # w_y, of the instruction
     condition_scale: float = 1.5  # w_I, of the image
     timesteps: str | None = None  # policy (guidance/timesteps.py); null: the rule's own
+    schedule_steps: int | None = None  # that the policy goes over, however long the run is; null: max_steps
     reduction: str = "sum"  # as the host's: its other losses are weighted against that
     min_step_percent: Scalar | None = None  # lowest noise level, a fraction of T, or a schedule over the host's steps
     max_step_percent: Scalar | None = None  # highest
     diffusion_steps: int = 20  # of the edits of single images
+    set_alpha_to_one: bool = True  # they end without noise; false: with that of timestep 0, as published
     per_editing_step: int = 10  # of in2n in our own systems; the host's say themselves when they edit
+    edit_begin_step: int = 0
+    edit_until_step: int | None = None
     edit_min_percent: float = 0.02  # in2n: limits of the noise level of an edit, fractions of T
     edit_max_percent: float = 0.98
     noise: str = "independent"  # alternating | paired

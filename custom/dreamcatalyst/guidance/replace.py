@@ -38,15 +38,18 @@ def denoise(
     text: Any,
     guidance_scale: float,
     image_guidance_scale: float,
+    set_alpha_to_one: bool = True,
 ) -> Tensor:
     """Deterministic DDIM (Song et al. 2021, equation 12, eta = 0) along `timesteps` to clean latents, [B,C,h,w].
 
-    noisy [B,C,h,w]: latents at the noise level of timesteps[0]. Raises PriorError at a level without signal.
+    noisy [B,C,h,w]: latents at the noise level of timesteps[0]. set_alpha_to_one (as diffusers calls it): end at abar
+    = 1, without noise; else at that of timestep 0, as Stable Diffusion's scheduler is configured.
+    Raises PriorError at a level without signal.
     """
-    x = noisy
+    x, end = noisy, 1.0 if set_alpha_to_one else abar_at(prior.alphas_cumprod, 0)
     for i, t in enumerate(timesteps):
         abar = signal_at(prior.alphas_cumprod, t)
-        after = abar_at(prior.alphas_cumprod, timesteps[i + 1]) if i + 1 < len(timesteps) else 1.0
+        after = abar_at(prior.alphas_cumprod, timesteps[i + 1]) if i + 1 < len(timesteps) else end
         branch = Branch(x, text, image, guidance_scale, image_guidance_scale)
         eps = predict_difference(prior, branch, None, t).to(x.dtype)
         clean = (x - (1.0 - abar) ** 0.5 * eps) / abar**0.5
@@ -66,12 +69,13 @@ def edit_image(
     steps: int = 20,
     guidance_scale: float = 7.5,
     image_guidance_scale: float = 1.5,
+    set_alpha_to_one: bool = True,
 ) -> Tensor:
     """The prior's edit, as latents [B,C,h,w]: of `latents` noised to `timestep` (Haque et al. 2023), or, where there
     are none, from `noise` alone at the prior's last timestep (Brooks et al. 2023).
 
     noise [B,C,h,w] standard normal; image, text: conditions. steps: of DDIM, fewer where there are not as many
-    timesteps.
+    timesteps. set_alpha_to_one: see `denoise`.
     """
     first = len(prior.alphas_cumprod) - 1 if timestep is None else timestep
     noisy = noise if latents is None else add_noise(latents, noise, abar_at(prior.alphas_cumprod, first))
@@ -83,6 +87,7 @@ def edit_image(
         text=text,
         guidance_scale=guidance_scale,
         image_guidance_scale=image_guidance_scale,
+        set_alpha_to_one=set_alpha_to_one,
     )
 
 

@@ -91,14 +91,19 @@ def progress_of(step: int, max_steps: int) -> float:
 
 @dataclass(frozen=True)
 class Schedule:
-    """A policy with its limits. lowest, highest: fractions of the noise levels; None for the policy's own."""
+    """A policy with its limits. lowest, highest: fractions of the noise levels; None for the policy's own. steps: that
+    the policy goes over, however long the run is; None: the run's. A shorter run then ends before the policy does, and
+    a longer one stays where it ends."""
 
     policy: str = "decreasing"
     lowest: float | None = None
     highest: float | None = None
     seed: int = 0
+    steps: int | None = None
 
     def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 1:
+            raise ConfigError(f"system.guidance.schedule_steps: got {self.steps}, expected 1 or more, or null.")
         lowest, highest = self.limits
         if not 0.0 <= lowest <= highest <= 1.0:
             raise ConfigError(
@@ -122,11 +127,12 @@ class Schedule:
     def timestep(self, step: int, max_steps: int, alphas_cumprod: Tensor) -> int:
         """The index 0..T-1 into alphas_cumprod [T] that `step` (from 0) of `max_steps` takes: a pure function of these,
         and of the seed where the policy draws."""
-        options = self.options(progress_of(step, max_steps), alphas_cumprod)
+        options = self.options(progress_of(step, self.steps or max_steps), alphas_cumprod)
         if len(options) == 1:
             return options[0]
         return options[int(torch.randint(len(options), (), generator=keyed_generator(self.seed, "timestep", step)))]
 
     def rest(self, alphas_cumprod: Tensor) -> Sequence[int]:
-        """The timesteps that a run comes to rest under: its last one, or all that a random policy draws."""
+        """The timesteps that a run over the whole schedule comes to rest under: its last one, or all that a random
+        policy draws."""
         return self.options(1.0, alphas_cumprod)
