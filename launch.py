@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
                 message = f"{error.filename or 'a file cannot be read or written'}: {error.strerror}"
             if args.verbose:
                 traceback.print_exc()
-            print(f"error: {message}", file=sys.stderr)
+            print(f"error: {' '.join(message.splitlines())}", file=sys.stderr)
             return 2
 
 
@@ -188,7 +188,9 @@ def classes(config: Any) -> dict[str, type]:
 
     found = {}
     for key, base in (("data", plugin.pl.LightningDataModule), ("system", plugin.BaseSystem)):
-        name = choose(key, getattr(config, f"{key}_type"), plugin.names(), f"{key}_type")
+        name, names = getattr(config, f"{key}_type"), plugin.names()
+        if name not in names:
+            choose(key, name, [other for other in names if other.endswith(f"-{key}")], f"{key}_type")
         found[key] = plugin.find(name)
         if not issubclass(found[key], base):
             raise ConfigError(f"{key}_type: '{name}' is registered, but is no {base.__name__}.")

@@ -309,6 +309,27 @@ def test_linking_elsewhere_is_refused(tmp_path, capsys):
     assert "is there already and is something else" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["custom/dreamcatalyst", "configs"])
+def test_linking_onto_a_loop_of_links_is_refused(tmp_path, capsys, name):
+    host = make_host(tmp_path / "host")
+    (host / name).symlink_to(Path(name).name)
+    assert launch.main(["--link", str(host)]) == 2
+    assert "error: --link: " in capsys.readouterr().err
+
+
+def test_linking_where_configs_is_a_file_is_refused(tmp_path, capsys):
+    host = make_host(tmp_path / "host")
+    (host / "configs").touch()
+    assert launch.main(["--link", str(host)]) == 2
+    assert "error: --link: " in capsys.readouterr().err
+
+
+def test_an_error_is_one_line_whatever_a_library_says(toy, capsys):
+    toy.write_bytes(b"PK\x03\x04\0")
+    assert launch.main(["--config", str(toy)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
 def test_where_links_cannot_be_made_a_copy_takes_their_place(tmp_path, capsys, monkeypatch):
     def refuse(*arguments, **options):
         raise OSError("no links here")

@@ -14,6 +14,14 @@ def link(source: Path, target: Path, host: Path) -> None:
     where the file system has no symlinks. Linking twice changes nothing. Raises ConfigError where `host` is no
     threestudio, or `target` is there and is something else, or a clone of this repository is in the host's custom/.
     """
+    try:
+        _link(source, target, host)
+    except (OSError, RuntimeError, shutil.Error) as error:  # a loop of links is a RuntimeError before Python 3.13
+        reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"--link: '{target}' cannot be made: {reason}.") from error
+
+
+def _link(source: Path, target: Path, host: Path) -> None:
     lacking = [name for name in ("launch.py", "threestudio", "custom") if not (host / name).exists()]
     if lacking:
         raise ConfigError(f"--link: '{host}' is no threestudio folder: it has no {' and no '.join(lacking)}.")

@@ -218,3 +218,18 @@ def test_max_side_bounds_the_longer_side_unless_a_size_is_given():
     assert fit(100, 50, CaptureOptions(max_side=256))[1:] == (100, 50)
     assert fit(538, 957, CaptureOptions(max_side=256, downscale=2))[1:] == (269, 478)
     assert fit(538, 957, CaptureOptions(max_side=256, width=400))[1:] == (400, 712)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_photograph_that_was_cut_off_is_refused_and_one_with_a_trailer_is_not(tmp_path, suffix):
+    noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    data = cv2.imencode(suffix, noise)[1].tobytes()
+    path, lens = tmp_path / f"a{suffix}", Lens(50, 50, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    photo = Photo(path, lens, (0, 0, WIDTH, HEIGHT), WIDTH, HEIGHT)
+    path.write_bytes(data)
+    whole = photo.load()
+    path.write_bytes(data + b"a telephone's film" * 99)
+    assert np.array_equal(photo.load(), whole)
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(DataError, match=f"a{suffix}: is (cut off or )?damaged"):
+        photo.load()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import threading
 from collections import OrderedDict
@@ -65,11 +66,13 @@ def image_size(path: Path) -> tuple[int, int]:
 def _decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
     """RGB uint8 [H,W,3] of an image file as stored: 8 or 16 bits, grey, colour or with alpha."""
     try:
-        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        data = path.read_bytes()
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error) as error:
         raise DataError(f"{path}: cannot be read ({error})") from error
     if image is None:
         raise DataError(f"{path}: is damaged or not an image; copy it again")
+    _require_whole(path, data)
     if image.dtype == np.uint16:
         image = (image / 257).round().astype(np.uint8)
     if image.dtype != np.uint8:
@@ -82,6 +85,19 @@ def _decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
         behind = np.asarray(background, np.float32) * 255
         rgb = (rgb * alpha + behind * (1 - alpha)).round().astype(np.uint8)
     return rgb
+
+
+def _require_whole(path: Path, data: bytes) -> None:
+    """Raise DataError where a PNG or JPEG was cut off: OpenCV makes up what is missing, and Pillow tells. It is asked
+    only of a file that does not end as these do, such as one with a telephone's trailer."""
+    if data.startswith((b"\x89PNG", b"\xff\xd8\xff")) and not data.endswith((b"IEND\xaeB`\x82", b"\xff\xd9")):
+        from PIL import Image
+
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                image.load()
+        except (OSError, SyntaxError) as error:
+            raise DataError(f"{path}: is cut off or damaged ({error}); copy it again") from error
 
 
 class ImageCache:
