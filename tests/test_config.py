@@ -157,6 +157,8 @@ class Ranges:
         ({"colour": [0, True, 0]}, "system.colour[1]: got True (bool), expected float."),
         ({"colour": [0, 0]}, "system.colour: got 2 values, expected 3 (tuple[float, float, float])."),
         ({"colour": 0.5}, "system.colour: got 0.5 (float), expected tuple[float, float, float]."),
+        ({"colour": (0, 0, -1)}, "system.colour[2]: got -1.0 (float), expected a number in [0, 1]."),
+        ({"rate": (0, 1.0, -2.0, 10)}, "system.rate: got -2.0 in "),
         ({"widths": [4, 0]}, "system.widths[1]: got 0 (int), expected 1 or more."),
         ({"shift": 10**400}, ", expected float."),
         ({"shift": float("-inf")}, "system.shift: got -inf (float), expected a finite number."),

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import re
+import typing
 from pathlib import Path
 
 import pytest
 import yaml
 from dreamcatalyst import OFFERS, plugin
-from dreamcatalyst.config import check, load_config, missing_keys
+from dreamcatalyst.config import ExperimentConfig, Range, check, load_config, missing_keys
+from dreamcatalyst.diffusion.api import PRIORS
+from dreamcatalyst.segment.api import SEGMENTERS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "custom" / "dreamcatalyst"
@@ -132,3 +136,55 @@ def test_every_config_names_registered_parts_and_valid_keys(path):
         name = getattr(config, f"{key}_type")
         assert name in OFFERS
         check(plugin.find(name), getattr(config, key), key)
+
+
+# --- ranges
+
+
+def parsed_classes() -> dict[str, type]:
+    """Every dataclass that is filled from a YAML, by the name of the part whose options it holds."""
+    found: dict[str, type] = {"experiment": ExperimentConfig}
+
+    def add(name: str, cls: type) -> None:
+        if not dataclasses.is_dataclass(cls):
+            for part, below in getattr(cls, "parts", {}).items():
+                add(f"{name}.{part}", below)
+            cls = getattr(cls, "Config", None)
+        if cls is not None:
+            found[name] = cls
+            for key, hint in typing.get_type_hints(cls).items():
+                if dataclasses.is_dataclass(hint):
+                    add(f"{name}.{key}", hint)
+
+    for registry in (PRIORS, SEGMENTERS):
+        for name in registry.names():
+            add(name, registry.get(name))
+    for name in OFFERS:
+        add(name, plugin.find(name))
+    return found
+
+
+def loose_numbers(hint) -> bool:
+    """Whether a type holds an int or a float that has no range."""
+    if hasattr(hint, "__metadata__"):
+        return not any(isinstance(note, Range) for note in hint.__metadata__)
+    return hint in (int, float) or any(loose_numbers(inner) for inner in typing.get_args(hint))
+
+
+def test_a_type_without_a_range_is_found_wherever_it_stands():
+    whole = typing.Annotated[int, Range("[0, 9]")]
+    assert loose_numbers(int) and loose_numbers(float | None) and loose_numbers(tuple[whole, float])
+    assert loose_numbers(typing.Annotated[float, "schedule"])
+    assert not (loose_numbers(bool) or loose_numbers(str | None) or loose_numbers(dict[str, whole] | None))
+
+
+def test_every_number_of_every_config_has_a_range():
+    classes, host = parsed_classes(), {f.name for f in dataclasses.fields(plugin.BaseSystem.Config)}
+    assert {"dreamcatalyst-edit-system.densify", "dreamcatalyst-prior-system.unet", "ip2p.freeu", "box"} <= set(classes)
+    loose = [
+        f"{name}.{key}"
+        for name, cls in classes.items()
+        for key, hint in typing.get_type_hints(cls, include_extras=True).items()
+        if key not in host and loose_numbers(hint)
+    ]
+    assert not loose

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Union
 
 import yaml
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from .errors import ConfigError, choose, nearest, unknown
@@ -62,10 +62,15 @@ Number = Annotated[float, Range("(-inf, inf)")]
 Positive = Annotated[float, Range("(0, inf)")]
 NonNegative = Annotated[float, Range("[0, inf)")]
 Fraction = Annotated[float, Range("[0, 1]")]
+PositiveFraction = Annotated[float, Range("(0, 1]")]
+BelowOne = Annotated[float, Range("[0, 1)")]
+Between = Annotated[float, Range("(0, 1)")]
+Colour = tuple[Fraction, Fraction, Fraction]  # RGB
 Integer = Annotated[int, Range("(-inf, inf)")]
 Count = Annotated[int, Range("[0, inf)")]
 AtLeastOne = Annotated[int, Range("[1, inf)")]
 Seed = Annotated[int, Range("[0, 4294967295]")]  # what all generators of random numbers take
+DdimSteps = Annotated[int, Range("[1, 1000]")]  # a prior has no more noise levels
 Side = Annotated[int, Range("[1, 32766]")]  # pixels; OpenCV resamples no longer sides
 
 Scalar = Annotated[float, "schedule"]
@@ -142,7 +147,7 @@ def _convert(hint: Any, raw: Any, place: str, default: Any) -> Any:
         return parse(hint, raw, place, default if isinstance(default, hint) else None)
     if hint is Any or (hint is dict and isinstance(raw, DictConfig)):
         return raw
-    if typing.get_origin(hint) in (tuple, list) and isinstance(raw, (list, tuple, ListConfig)):
+    if typing.get_origin(hint) in (tuple, list) and _several(raw):
         return _sequence(hint, raw, place)
     leaf = OmegaConf.structured(dataclasses.make_dataclass("Leaf", [("value", hint)]))
     try:
@@ -215,6 +220,11 @@ def _show(raw: Any) -> str:
 # --- schedules -------------------------------------------------------------------------------------------------------
 
 
+def _several(raw: Any) -> bool:
+    """Whether this is a list or a tuple, or what OmegaConf makes of one."""
+    return isinstance(raw, Sequence) and not isinstance(raw, (str, bytes))
+
+
 def _number(raw: Any) -> bool:
     return isinstance(raw, (int, float)) and not isinstance(raw, bool)
 
@@ -230,7 +240,7 @@ def _scalar(raw: Any, place: str) -> float | tuple[int | float, ...]:
             return _finite(float(raw), raw, place)
         except ValueError as error:
             raise wrong from error
-    if not isinstance(raw, (list, tuple, ListConfig)):
+    if not _several(raw):
         raise wrong
     for item in raw:
         if not _number(item):
@@ -449,7 +459,7 @@ def _dotlist(arguments: Sequence[str]) -> DictConfig:
             parsed = text
         is_text = isinstance(parsed, str) and text[:1] not in ("'", '"')
         is_word = isinstance(parsed, bool) and text.lower() not in ("true", "false")
-        is_prose = isinstance(parsed, (DictConfig, ListConfig)) and text[:1] not in ("[", "{")
+        is_prose = OmegaConf.is_config(parsed) and text[:1] not in ("[", "{")
         try:
             OmegaConf.update(config, key, text if is_text or is_word or is_prose else parsed, force_add=True)
         except OmegaConfBaseException as error:

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.data.images import ImageCache, Photo
 from dreamcatalyst.data.lens import Lens
 from dreamcatalyst.data.views import Capture, CaptureOptions, fit, open_capture, split, views_for_step
-from dreamcatalyst.errors import DataError
+from dreamcatalyst.errors import DataError, DreamCatalystError
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -87,6 +88,9 @@ def test_a_crop_lies_inside_and_has_the_targets_aspect(width, height, out_width,
     "options, message",
     [
         (dict(downscale=0.5), "data.downscale: got 0.5"),
+        (dict(downscale="nan"), "data.downscale: got 'nan'"),
+        (dict(width=1_000_000), "data.width: got 1000000"),
+        (dict(orbit_views=1_000_000), "data.orbit_views: got 1000000"),
         (dict(downscale=2, width=64), "data.downscale and data.width"),
         (dict(width=0), "data.width: got 0"),
         (dict(test_every=-1), "data.test_every: got -1"),
@@ -96,8 +100,8 @@ def test_a_crop_lies_inside_and_has_the_targets_aspect(width, height, out_width,
     ],
 )
 def test_options_that_cannot_be(options, message):
-    with pytest.raises(DataError, match=message):
-        CaptureOptions(**options)
+    with pytest.raises(DreamCatalystError, match=message):
+        parse(CaptureOptions, options, "data")
 
 
 def test_nothing_to_read(tmp_path):

@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.diffusion import closed_form
 from dreamcatalyst.diffusion.api import Row
 from dreamcatalyst.diffusion.closed_form import ClosedForm, ClosedFormConfig
-from dreamcatalyst.errors import PriorError
+from dreamcatalyst.errors import ConfigError, PriorError
 
 CONFIG = ClosedFormConfig(s=0.05, s_image=0.4, s_null=0.9, mu=0.2)
 
@@ -78,8 +79,8 @@ def test_open_spreads_say_how_to_close_them():
     with pytest.raises(PriorError, match="s_image"):
         ClosedForm().predict_noise([Row(images())], 500)
     assert ClosedForm(ClosedFormConfig(s_image=0.3)).spreads() == (0.05, 0.3, 0.3)
-    with pytest.raises(PriorError, match="positive"):
-        ClosedFormConfig(s=0.0)
+    with pytest.raises(ConfigError, match="s: got 0.0 .float., expected more than 0"):
+        parse(ClosedFormConfig, {"s": 0.0})
 
 
 def test_an_instruction_needs_an_image():

@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.diffusion.freeu import FreeU, FreeUConfig, filter_low_frequencies, freeu_sites
 from dreamcatalyst.errors import ConfigError, PriorError
 
@@ -171,4 +172,4 @@ def test_a_network_without_sites_is_refused():
 )
 def test_bad_settings_are_refused(values, message):
     with pytest.raises(ConfigError, match=message):
-        FreeUConfig(**values)
+        parse(FreeUConfig, values, "freeu")

@@ -9,6 +9,7 @@ import warnings
 import pytest
 import torch
 import torch.nn.functional as F
+from dreamcatalyst.config import parse
 from dreamcatalyst.diffusion import folder as folder_module
 from dreamcatalyst.diffusion.api import PRIORS, Row
 from dreamcatalyst.diffusion.freeu import FreeUConfig
@@ -236,7 +237,7 @@ def test_too_little_memory_is_refused_before_weights_are_read(models, monkeypatc
 )
 def test_bad_settings_are_refused(values, message):
     with pytest.raises(ConfigError, match=message):
-        Ip2pConfig(**values)
+        parse(Ip2pConfig, values, "prior")
 
 
 # -- images and latents ------------------------------------------------------------------------------------------------

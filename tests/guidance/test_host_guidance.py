@@ -323,7 +323,10 @@ def test_the_keys_of_the_guidance_that_stood_there_are_taken(models):
         ({"guidance_scale": [1, 2]}, "system.guidance.guidance_scale: got [1, 2] (list), expected float."),
         ({"max_steps": "many"}, "system.guidance.max_steps: got 'many' (str), expected int."),
         ({"max_step_percent": [0.9, 0.5]}, "system.guidance.max_step_percent: a schedule of 2 numbers"),
-        ({"max_step_percent": [0.9, 1.5, 1000]}, "max_step_percent 1.5 must be fractions"),  # not only at step 1000
+        (
+            {"max_step_percent": [0.9, 1.5, 1000]},
+            "max_step_percent: got 1.5 in [0.9, 1.5, 1000]",
+        ),  # not only at step 1000
         ({"references": "nowhere"}, "system.guidance.references: 'nowhere' is no folder"),
     ],
 )

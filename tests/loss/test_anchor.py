@@ -164,4 +164,4 @@ def test_the_config_is_checked():
         ({"proximal_rate": math.nan}, "proximal_rate: got nan"),
     ]:
         with pytest.raises(ConfigError, match=message):
-            AnchorConfig(**options)
+            parse(AnchorConfig, options)

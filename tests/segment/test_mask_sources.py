@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.errors import ConfigError, DataError, SceneError
 from dreamcatalyst.segment.api import MaskConfig, make_mask
 from dreamcatalyst.segment.box import Box
@@ -127,11 +128,15 @@ def test_the_edge_of_a_rectangle_counts_in_part(disc_world):
         ({"low": (0, 0, 0), "high": (1, 0, 1)}, "must lie below high"),
         ({"center": (0, 0, 0), "radius": 0.0}, "radius: got 0.0"),
         ({"view": "0", "window": (0.5, 0, 0.2, 1)}, "left < right"),
+        ({"view": "0", "window": (-0.5, 0, 0.2, 1)}, r"window\[0\]: got -0.5"),
+        ({"view": "0", "window": (0, 0, float("nan"), 1)}, r"window\[2\]: got nan"),
+        ({"low": (0, float("nan"), 0), "high": (1, 1, 1)}, r"low\[1\]: got nan .float., expected a finite number"),
+        ({"center": (0, 0, 0), "radius": float("inf")}, "radius: got inf"),
     ],
 )
 def test_boxes_that_cannot_be(options, words):
     with pytest.raises(ConfigError, match=words):
-        Box(**options)
+        parse(Box, options, "system.mask.options")
 
 
 def test_views_and_windows_that_are_not_there(disc_world):

@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.diffusion.closed_form import noise_slope
 from dreamcatalyst.errors import ConfigError, PriorError
 from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
@@ -155,4 +156,4 @@ def test_without_a_prior_there_is_none(disc_world):
 )
 def test_options_that_cannot_be(options):
     with pytest.raises(ConfigError):
-        Relevance(**options)
+        parse(Relevance, options)

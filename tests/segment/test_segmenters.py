@@ -98,9 +98,9 @@ def test_kinds_and_values_are_checked():
     with pytest.raises(ConfigError, match="vote: unknown vote 'weight'"):
         MaskConfig(vote="weight")
     with pytest.raises(ConfigError, match="threshold: got 0"):
-        MaskConfig(threshold=0.0)
+        parse(MaskConfig, {"threshold": 0.0})
     with pytest.raises(ConfigError, match="feather: got -1"):
-        MaskConfig(feather=-1.0)
+        parse(MaskConfig, {"feather": -1.0})
 
 
 def test_threshold_grow_invert_feather_come_in_this_order(disc_world, options):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.errors import ConfigError, PriorError, SceneError
 from dreamcatalyst.segment.api import MaskConfig, make_mask
 from dreamcatalyst.segment.text import ClipSeg, GroundedSam, Text
@@ -88,4 +89,4 @@ def test_wrong_models_are_refused(clipseg, grounded, tmp_path, disc_world, monke
 @pytest.mark.parametrize("options", [{}, {"text": " . "}, {"text": "fox", "threshold": 1.5}])
 def test_options_that_cannot_be(options):
     with pytest.raises(ConfigError):
-        Text(**options)
+        parse(Text, options)

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..config import AtLeastOne, Colour, Count, NonNegative, Range, Side
 from ..errors import DataError
 from ..registry import Registry
 from .camera import Cameras
@@ -33,32 +34,22 @@ class CaptureOptions:
 
     format: str | None = None  # one of FORMATS; None: whichever finds its files
     images: str = "images"  # folder of the photographs in a COLMAP capture
-    downscale: float = 1.0  # photographs are made smaller by this factor, at least 1
-    width: int | None = None  # pixels; with height: centred crop to their aspect, then resize
-    height: int | None = None  # pixels; width or height alone: the other follows the photograph's aspect
-    max_side: int | None = None  # pixels, longer side at most, where no downscale, width or height is given
-    test_every: int = 8  # every so many views one is held out, from the first on; 0: none
-    max_view_num: int | None = None  # views to train on at most, spread evenly over the capture; None: all
-    resident_gib: float = 2.0  # GiB of decoded photographs kept in memory
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB in [0,1] behind transparent photographs
+    downscale: Annotated[float, Range("[1, inf)")] = 1.0  # photographs are made smaller by this factor, at least 1
+    width: Side | None = None  # pixels; with height: centred crop to their aspect, then resize
+    height: Side | None = None  # pixels; width or height alone: the other follows the photograph's aspect
+    max_side: Side | None = None  # pixels, longer side at most, where no downscale, width or height is given
+    test_every: Count = 8  # every so many views one is held out, from the first on; 0: none
+    max_view_num: AtLeastOne | None = None  # views to train on at most, spread evenly over the capture; None: all
+    resident_gib: NonNegative = 2.0  # GiB of decoded photographs kept in memory
+    background: Colour = (0.0, 0.0, 0.0)  # RGB in [0,1] behind transparent photographs
     dataparser: str = ""  # nerfstudio's dataparser_transforms.json of the splats: cameras are moved into their world
-    orbit_views: int = 48  # views of an orbit around splats that come without cameras
+    orbit_views: Annotated[int, Range("[1, 10000]")] = 48  # views of an orbit around splats that come without cameras
     orbit_up: str = "-y"  # x, y, z, -x, -y or -z: which way is up in them; -y suits COLMAP's worlds, z nerfstudio's
 
     def __post_init__(self) -> None:
-        if self.resident_gib < 0:
-            raise DataError(f"data.resident_gib: got {self.resident_gib}, expected 0 or more")
-        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
-            raise DataError(f"data.background: got {self.background}, expected red, green and blue in [0,1]")
         sized = self.width is not None or self.height is not None
-        if self.downscale < 1:
-            raise DataError(f"data.downscale: got {self.downscale}, expected 1 or more")
         if self.downscale != 1 and sized:
             raise DataError("data.downscale and data.width or data.height: both set a size; leave one of them out")
-        for name, least in dict(width=1, height=1, max_side=1, test_every=0, max_view_num=1, orbit_views=1).items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise DataError(f"data.{name}: got {value}, expected {least} or more")
 
 
 class Points(NamedTuple):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..config import Number, Positive
 from ..errors import PriorError
 from .api import Prior, Row
 from .noise import abar_at, stable_diffusion_schedule
@@ -21,16 +22,10 @@ from .operators import Operator, find_operator
 class ClosedFormConfig:
     """Spreads and means in latent units, [-1,1]."""
 
-    s: float = 0.05  # of x_0 given image and instruction, around T(image)
-    s_image: float | None = None  # of x_0 given the image, around the image; None: solved (guidance/fixed_point.py)
-    s_null: float | None = None  # of x_0 given nothing, around mu; None: the same as s_image
-    mu: float = 0.0  # mean of x_0 given nothing; it cancels in every rule that has a source branch
-
-    def __post_init__(self) -> None:
-        for name in ("s", "s_image", "s_null"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise PriorError(f"closed-form.{name}: got {value}, expected a positive spread in units of [-1,1]")
+    s: Positive = 0.05  # of x_0 given image and instruction, around T(image)
+    s_image: Positive | None = None  # of x_0 given the image, around the image; None: solved (guidance/fixed_point.py)
+    s_null: Positive | None = None  # of x_0 given nothing, around mu; None: the same as s_image
+    mu: Number = 0.0  # mean of x_0 given nothing; it cancels in every rule that has a source branch
 
 
 class SourceImage:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ..config import NonNegative
 from ..errors import ConfigError, PriorError, choose
 
 MODES = ("none", "paper", "diffusers")
@@ -30,18 +31,15 @@ class FreeUConfig:
     """
 
     mode: str = "none"
-    b1: float = 1.1
-    b2: float = 1.1
-    s1: float = 0.9
-    s2: float = 0.2
+    b1: NonNegative = 1.1
+    b2: NonNegative = 1.1
+    s1: NonNegative = 0.9
+    s2: NonNegative = 0.2
 
     def __post_init__(self) -> None:
         choose("FreeU mode", self.mode, MODES, "freeu.mode")
         for name in ("b1", "b2", "s1", "s2"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ConfigError(f"freeu.{name}: got {value}, expected a finite factor of at least 0 (1: unchanged)")
-            if self.mode == "diffusers" and value == 0:
+            if self.mode == "diffusers" and getattr(self, name) == 0:
                 raise ConfigError(f"freeu.{name}: diffusers takes a factor of 0 for 'off'; use 1e-6 or mode 'paper'")
 
     @property

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
+from ..config import AtLeastOne, Seed
 from ..errors import ConfigError, PriorError, choose
 from .api import Prior, Row
 from .autoencoder import Autoencoder, load_autoencoder
@@ -65,7 +66,7 @@ class Ip2pConfig:
     autoencoder: str | None = None
     latents: str = "mode"
     condition_unit_range: bool = False
-    seed: int = 0
+    seed: Seed = 0
     freeu: FreeUConfig = field(default_factory=FreeUConfig)
     slicing: bool = False
     tiling: bool = False
@@ -73,7 +74,7 @@ class Ip2pConfig:
     compile: bool = False
     offload: bool = False
     checkpointing: bool = False
-    max_rows: int | None = None
+    max_rows: AtLeastOne | None = None
 
     def __post_init__(self) -> None:
         choose("precision", self.dtype, DTYPES, "prior.dtype")
@@ -82,8 +83,6 @@ class Ip2pConfig:
             raise ConfigError(
                 f"prior.latents={self.latents}: a tiny autoencoder has no posterior to sample; set latents=mode"
             )
-        if self.max_rows is not None and self.max_rows < 1:
-            raise ConfigError(f"prior.max_rows: got {self.max_rows}, expected at least 1, or null for no limit")
 
 
 class LatentDiffusion(Prior):

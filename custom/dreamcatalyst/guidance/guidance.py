@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..cache import ByteCache
-from ..config import parse
+from ..config import AtLeastOne, Count, DdimSteps, Fraction, NonNegative, Number, Seed, parse
 from ..diffusion.api import PRIORS, Prior
 from ..diffusion.noise import keyed_generator, keyed_noise
 from ..errors import PriorError, choose
@@ -34,27 +34,27 @@ class GuidanceConfig:
     prior: dict = field(default_factory=dict)  # the prior's own options
     rule: str = "dreamcatalyst"  # a row of guidance/rules.py
     preset: str = "paper"  # chi, delta, gamma: paper (0.075, 0.2, 0.8) | published-3dgs (0.075, 0.05, 0.2)
-    chi: float | None = None  # single ones replaced; null: the preset's
-    delta: float | None = None
-    gamma: float | None = None
-    gap: int | None = None  # of PDS, in timesteps
-    implicit_step: float | None = None  # length of a step that takes the identity term implicitly; 0: explicitly
-    guidance_scale: float = 7.5  # w_y, of the instruction
-    condition_scale: float = 1.5  # w_I, of the image
+    chi: NonNegative | None = None  # single ones replaced; null: the preset's
+    delta: NonNegative | None = None
+    gamma: NonNegative | None = None
+    gap: AtLeastOne | None = None  # of PDS, in timesteps
+    implicit_step: NonNegative | None = None  # length of a step that takes the identity term implicitly; 0: explicitly
+    guidance_scale: Number = 7.5  # w_y, of the instruction
+    condition_scale: Number = 1.5  # w_I, of the image
     timesteps: str | None = None  # policy (guidance/timesteps.py); null: the rule's own
-    schedule_steps: int | None = None  # that the policy goes over, however long the run is; null: the run's
+    schedule_steps: AtLeastOne | None = None  # that the policy goes over, however long the run is; null: the run's
     reduction: str = "mean"  # of the loss over latent elements: mean | sum
-    min_step_percent: float | None = None  # lowest noise level, a fraction of T; null: the policy's (decreasing 0.2)
-    max_step_percent: float | None = None  # highest; null: the policy's (decreasing 0.9)
-    diffusion_steps: int = 20  # of the edits of single images that in2n makes
+    min_step_percent: Fraction | None = None  # lowest noise level, a fraction of T; null: the policy's (decreasing 0.2)
+    max_step_percent: Fraction | None = None  # highest; null: the policy's (decreasing 0.9)
+    diffusion_steps: DdimSteps = 20  # of the edits of single images that in2n makes
     set_alpha_to_one: bool = True  # these edits end without noise; false: with that of timestep 0, as published
-    per_editing_step: int = 10  # in2n: visits at its multiples edit the view anew; 0: only first visits edit
-    edit_begin_step: int = 0  # in2n: these edits anew take place after this step
-    edit_until_step: int | None = None  # and before this one; null: to the end
-    edit_min_percent: float = 0.02  # in2n: limits of the noise level of an edit, fractions of T
-    edit_max_percent: float = 0.98
+    per_editing_step: Count = 10  # in2n: visits at its multiples edit the view anew; 0: only first visits edit
+    edit_begin_step: Count = 0  # in2n: these edits anew take place after this step
+    edit_until_step: Count | None = None  # and before this one; null: to the end
+    edit_min_percent: Fraction = 0.02  # in2n: limits of the noise level of an edit, fractions of T
+    edit_max_percent: Fraction = 0.98
     noise: str = "independent"  # alternating: e and -e on a view's visits in turn; paired: both in each step
-    seed: int = 0  # of noise and random timesteps
+    seed: Seed = 0  # of noise and random timesteps
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
-from ..config import Scalar
+from ..config import AtLeastOne, Count, DdimSteps, Fraction, NonNegative, Number, Range, Scalar, Seed
 
 # The host's name of an option of the prior: ours (a dot leads into a section), and the host's values as ours where they
 # differ. A value that is not among these says nothing.
@@ -41,6 +41,9 @@ WITHOUT_EFFECT = {
 }
 
 
+Limit = Annotated[Scalar, Range("[0, 1]")]
+
+
 @dataclass
 class HostConfig:
     """A plain dataclass, since the host's are not frozen and may not inherit one that is."""
@@ -50,47 +53,47 @@ class HostConfig:
     prior: dict = field(default_factory=dict)  # the prior's own options
     rule: str = "dreamcatalyst"  # a row of guidance/rules.py
     preset: str = "paper"  # chi, delta, gamma: paper | published-3dgs
-    chi: float | None = None  # single ones replaced; null: the preset's
-    delta: float | None = None
-    gamma: float | None = None
-    gap: int | None = None  # of PDS, in timesteps
-    implicit_step: float | None = None  # length of a step that takes the identity term implicitly; 0: explicitly
-    guidance_scale: float = 7.5  # w_y, of the instruction
-    condition_scale: float = 1.5  # w_I, of the image
+    chi: NonNegative | None = None  # single ones replaced; null: the preset's
+    delta: NonNegative | None = None
+    gamma: NonNegative | None = None
+    gap: AtLeastOne | None = None  # of PDS, in timesteps
+    implicit_step: NonNegative | None = None  # length of a step that takes the identity term implicitly; 0: explicitly
+    guidance_scale: Number = 7.5  # w_y, of the instruction
+    condition_scale: Number = 1.5  # w_I, of the image
     timesteps: str | None = None  # policy (guidance/timesteps.py); null: the rule's own
-    schedule_steps: int | None = None  # that the policy goes over, however long the run is; null: max_steps
+    schedule_steps: AtLeastOne | None = None  # that the policy goes over, however long the run is; null: max_steps
     reduction: str = "sum"  # as the host's: its other losses are weighted against that
-    min_step_percent: Scalar | None = None  # lowest noise level, a fraction of T, or a schedule over the host's steps
-    max_step_percent: Scalar | None = None  # highest
-    diffusion_steps: int = 20  # of the edits of single images
+    min_step_percent: Limit | None = None  # lowest noise level, a fraction of T, or a schedule over the host's steps
+    max_step_percent: Limit | None = None  # highest
+    diffusion_steps: DdimSteps = 20  # of the edits of single images
     set_alpha_to_one: bool = True  # they end without noise; false: with that of timestep 0, as published
-    per_editing_step: int = 10  # of in2n in our own systems; the host's say themselves when they edit
-    edit_begin_step: int = 0
-    edit_until_step: int | None = None
-    edit_min_percent: float = 0.02  # in2n: limits of the noise level of an edit, fractions of T
-    edit_max_percent: float = 0.98
+    per_editing_step: Count = 10  # of in2n in our own systems; the host's say themselves when they edit
+    edit_begin_step: Count = 0
+    edit_until_step: Count | None = None
+    edit_min_percent: Fraction = 0.02  # in2n: limits of the noise level of an edit, fractions of T
+    edit_max_percent: Fraction = 0.98
     noise: str = "independent"  # alternating | paired
-    seed: int = 0  # of noise and random timesteps
+    seed: Seed = 0  # of noise and random timesteps
 
     # --- what a guidance in the host must be told besides
-    max_steps: int | None = None  # length of the run, over which decreasing timesteps go: ${trainer.max_steps}
-    max_iteration: int | None = None  # its name in the published code
+    max_steps: AtLeastOne | None = None  # length of the run, over which decreasing timesteps go: ${trainer.max_steps}
+    max_iteration: AtLeastOne | None = None  # its name in the published code
     prompt: str = ""  # words for the prior's own text encoder; empty: the host's prompt processor is asked
     source_prompt: str = ""
     view_dependent_prompting: bool = False  # ask it for the texts of the batch's viewing angles
     loss_name: str = "sds"  # of the loss that is returned, loss_<name>; the YAML must have system.loss.lambda_<name>
     references: str = ""  # a folder of source images in the order of the views' `index`, for systems that pass none
-    fixed_size: int = -1  # pixels, square, to which images are resized to be encoded; -1: they are taken as they are
+    fixed_size: Annotated[int, Range("[-1, 32766]")] = -1  # pixels a side, to which images are resized; -1: as they are
 
     # --- the host's names of the prior's options (ALIASES); `prior` goes first
     ip2p_name_or_path: str | None = None
     half_precision_weights: bool | None = None
     enable_sequential_cpu_offload: bool = False
     enable_channels_last_format: bool = False
-    freeu_b1: float | None = None
-    freeu_b2: float | None = None
-    freeu_s1: float | None = None
-    freeu_s2: float | None = None
+    freeu_b1: NonNegative | None = None
+    freeu_b2: NonNegative | None = None
+    freeu_s1: NonNegative | None = None
+    freeu_s2: NonNegative | None = None
 
     # --- WITHOUT_EFFECT
     pretrained_model_name_or_path: Any = None

@@ -7,12 +7,12 @@ decay is decoupled in AdamW, Loshchilov & Hutter 2019).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ..config import NonNegative
 from ..errors import ConfigError, choose
 from ..scene.edit import Splats
 from ..scene.generations import ANCHORS, Generations, anchor_of
@@ -32,22 +32,19 @@ class AnchorConfig:
 
     kind: str = "none"  # none | last-densify (as published: slows splats down) | source (ties them to the source scene)
     form: str = "loss"  # loss (as published) | proximal (a step of its own after the optimizer's)
-    weight_init_g0: float = 0.05  # W of the splats that the run begins with
-    weight_init: float = 0.1  # W of a later generation, from its second densification on; before it is 0
-    weight_multiplier: float = 1.3  # on every W, at each densification
-    max_weight: float = 10.0  # no W grows beyond it
-    lambda_color: float = 5.0  # SH coefficients
-    lambda_geo: float = 5.0  # means (world units) and quaternions
-    lambda_opacity: float = 5.0  # logits
-    lambda_scale: float = 5.0  # logarithms
-    proximal_rate: float = 1e-3  # c, per step: the share of its offset that a splat of weight 1 gives up in each step
+    weight_init_g0: NonNegative = 0.05  # W of the splats that the run begins with
+    weight_init: NonNegative = 0.1  # W of a later generation, from its second densification on; before it is 0
+    weight_multiplier: NonNegative = 1.3  # on every W, at each densification
+    max_weight: NonNegative = 10.0  # no W grows beyond it
+    lambda_color: NonNegative = 5.0  # SH coefficients
+    lambda_geo: NonNegative = 5.0  # means (world units) and quaternions
+    lambda_opacity: NonNegative = 5.0  # logits
+    lambda_scale: NonNegative = 5.0  # logarithms
+    proximal_rate: NonNegative = 1e-3  # c: the share of its offset that a splat of weight 1 gives up in each step
 
     def __post_init__(self) -> None:
         choose("anchor", self.kind, ("none", *ANCHORS), "kind")
         choose("form of the anchor", self.form, FORMS, "form")
-        for name, value in vars(self).items():
-            if not isinstance(value, str) and not (math.isfinite(value) and value >= 0):
-                raise ConfigError(f"{name}: got {value}, expected a number of 0 or more.")
         for name in ("weight_init_g0", "weight_init"):
             value = getattr(self, name)
             if value > self.max_weight:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..config import parse
+from ..config import AtLeastOne, NonNegative, PositiveFraction, parse
 from ..data.camera import Cameras
 from ..errors import ConfigError, choose
 from ..guidance.guidance import Guidance
@@ -39,25 +39,19 @@ class MaskConfig:
 
     kind: str = NONE  # none | files | box | relevance | text | kept: what says which part is meant
     options: dict = field(default_factory=dict)  # the kind's own: the fields of segment/<kind>.py
-    views: int | None = 24  # views that are looked at, spread evenly over those of training; null: all of them
+    views: AtLeastOne | None = 24  # views that are looked at, spread evenly over those of training; null: all of them
     vote: str = "weighted"  # by how much of a splat is seen; gaussian-editor: by pixels, as its code does (on the CPU)
-    min_evidence: float = 0.5  # pixels of a splat to be seen over all views, else its neighbours decide
-    neighbours: int = 8  # nearest decided splats that decide for one
-    threshold: float = 0.5  # of the weight, in (0,1]
-    grow: float = 0.0  # distance to the found splats within which others join, a fraction of the scene's extent
+    min_evidence: NonNegative = 0.5  # pixels of a splat to be seen over all views, else its neighbours decide
+    neighbours: AtLeastOne = 8  # nearest decided splats that decide for one
+    threshold: PositiveFraction = 0.5  # of the weight, in (0,1]
+    grow: NonNegative = 0.0  # distance to the found splats within which others join, a fraction of the scene's extent
     invert: bool = False  # everything else
-    feather: float = 0.0  # width over which the update falls off towards the mask's border, fraction of the extent
+    feather: NonNegative = 0.0  # width over which updates fall off towards the mask's border, fraction of the extent
     cache: str = ""  # folder in which masks are kept; empty: the run's own choice
 
     def __post_init__(self) -> None:
         choose("kind of mask", self.kind, (NONE, *SEGMENTERS.names()), "kind")
         choose("vote", self.vote, VOTES, "vote")
-        for name, least in dict(views=1, neighbours=1, min_evidence=0, grow=0, feather=0).items():
-            value = getattr(self, name)
-            if value is not None and not value >= least:
-                raise ConfigError(f"{name}: got {value}, expected {least} or more.")
-        if not 0 < self.threshold <= 1:
-            raise ConfigError(f"threshold: got {self.threshold}, expected a weight above 0, at most 1.")
         if self.kind == NONE and (self.options or self.invert):
             raise ConfigError(f"kind: none takes no options and no invert. Known: {', '.join(SEGMENTERS.names())}.")
 

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..config import NonNegative, Number, Positive
 from ..errors import ConfigError, nearest
 from .api import MaskRequest, Segmenter
 
+Point = tuple[Number, Number, Number]
+Window = tuple[NonNegative, NonNegative, NonNegative, NonNegative]
 FORMS = "low and high (a box), center and radius (a sphere), or view and window (a rectangle in one view)"
 
 
@@ -23,12 +26,12 @@ class Box(Segmenter):
     nearest neighbours that it does see. So background that shows between the object and the rectangle's corners is in.
     """
 
-    low: tuple[float, float, float] | None = None  # corner of a box along the world's axes, world units
-    high: tuple[float, float, float] | None = None  # the opposite corner
-    center: tuple[float, float, float] | None = None  # of a sphere, world units
-    radius: float | None = None
+    low: Point | None = None  # corner of a box along the world's axes, world units
+    high: Point | None = None  # the opposite corner
+    center: Point | None = None  # of a sphere, world units
+    radius: Positive | None = None
     view: str | None = None  # name or number of a view
-    window: tuple[float, float, float, float] | None = None  # left, top, right, bottom, from the upper left corner:
+    window: Window | None = None  # left, top, right, bottom, from the upper left corner:
     # pixels of the render, or fractions of its sides where none is over 1
 
     def __post_init__(self) -> None:
@@ -39,10 +42,8 @@ class Box(Segmenter):
             raise ConfigError(f"got {', '.join(names) or 'nothing'}, expected one of: {FORMS}.")
         if self.low and not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ConfigError(f"low: {self.low} must lie below high, {self.high}, along each axis.")
-        if self.radius is not None and not self.radius > 0:
-            raise ConfigError(f"radius: got {self.radius}, expected more than 0.")
-        if self.window and not (0 <= self.window[0] < self.window[2] and 0 <= self.window[1] < self.window[3]):
-            raise ConfigError(f"window: got {self.window}, expected left < right and top < bottom, none below 0.")
+        if self.window and not (self.window[0] < self.window[2] and self.window[1] < self.window[3]):
+            raise ConfigError(f"window: got {self.window}, expected left < right and top < bottom.")
 
     def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor] | Tensor:
         means = request.scene.means.detach()

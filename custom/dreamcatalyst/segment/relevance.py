@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from .. import plugin
+from ..config import AtLeastOne, Between, Fraction, NonNegative, PositiveFraction, Seed
 from ..diffusion.api import Row
 from ..diffusion.noise import abar_at, add_noise, keyed_noise
 from ..errors import ConfigError, PriorError, choose
@@ -54,31 +55,22 @@ class Relevance(Segmenter):
     """Views differ in how much of the edit they show, so all are normalised together: a view in which the instruction
     changes nothing stays empty, where its own maximum would have been made 1."""
 
-    lowest: float = 0.4  # noise levels that are looked at, as fractions of T: the lowest
-    highest: float = 0.8  # and the highest
-    timesteps: int = 2  # levels, evenly spread from lowest to highest
-    draws: int = 1  # noise draws per level
+    lowest: Between = 0.4  # noise levels that are looked at, as fractions of T: the lowest
+    highest: Between = 0.8  # and the highest
+    timesteps: AtLeastOne = 2  # levels, evenly spread from lowest to highest
+    draws: AtLeastOne = 1  # noise draws per level
     noise: str = "paired"  # each draw with both signs, where what is linear in it cancels; independent: as published
-    threshold: float = 0.5  # of the normalised relevance, in (0,1)
-    softness: float = 0.2  # width of the ramp of the mask around the threshold; 0: a step
-    blur: float = 0.01  # standard deviation of a Gaussian blur before it, fraction of the view's longer side
-    everywhere: float = 0.08  # an edit of all where the least tenth changes by this share of the 99th percentile, and
-    # by far more than nothing does (NOTHING); 1: never
-    seed: int = 0  # of the noise
+    threshold: Between = 0.5  # of the normalised relevance, in (0,1)
+    softness: NonNegative = 0.2  # width of the ramp of the mask around the threshold; 0: a step
+    blur: Fraction = 0.01  # standard deviation of a Gaussian blur before it, fraction of the view's longer side
+    everywhere: PositiveFraction = 0.08  # an edit of all where the least tenth changes by this share of the 99th
+    # percentile, and by far more than nothing does (NOTHING); 1: never
+    seed: Seed = 0  # of the noise
 
     def __post_init__(self) -> None:
         choose("kind of noise", self.noise, ("paired", "independent"), "noise")
-        if not 0 < self.lowest <= self.highest < 1:
-            raise ConfigError(
-                f"lowest, highest: got {self.lowest} and {self.highest}, expected 0 < lowest <= highest < 1."
-            )
-        for name in ("timesteps", "draws"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected 1 or more.")
-        if not 0 < self.threshold < 1 or self.softness < 0 or self.blur < 0:
-            raise ConfigError("threshold must lie between 0 and 1, softness and blur must not be negative.")
-        if not 0 < self.everywhere <= 1:
-            raise ConfigError(f"everywhere: got {self.everywhere}, expected more than 0 and at most 1 (1: never).")
+        if self.lowest > self.highest:
+            raise ConfigError(f"lowest, highest: got {self.lowest} and {self.highest}, expected lowest <= highest.")
 
     def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor]:
         guidance = _guidance(request)

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..config import Between
 from ..diffusion.folder import find_folder, load, not_given
 from ..errors import ConfigError, PriorError, SceneError
 from .api import MaskRequest, Segmenter
@@ -33,13 +34,11 @@ class Text(Segmenter):
     text: str = ""  # what to look for: things ("fox head"), not an instruction
     path: str = EXAMPLES[CLIPSEG]  # CLIPSeg or Grounding DINO: folder, or id on Hugging Face
     sam: str = EXAMPLES[SAM]  # cuts out what Grounding DINO finds; CLIPSeg needs none
-    threshold: float | None = None  # of a pixel (CLIPSeg: 0.4) or of a box (Grounding DINO: 0.35), in (0,1)
+    threshold: Between | None = None  # of a pixel (CLIPSeg: 0.4) or of a box (Grounding DINO: 0.35), in (0,1)
 
     def __post_init__(self) -> None:
         if not self.phrases:
             raise ConfigError('text: is empty. Say what to look for, such as text="fox head".')
-        if self.threshold is not None and not 0 < self.threshold < 1:
-            raise ConfigError(f"threshold: got {self.threshold}, expected a number between 0 and 1.")
 
     @property
     def phrases(self) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 from torch.utils.data import DataLoader, IterableDataset
 
 from .. import plugin
-from ..config import parse
+from ..config import AtLeastOne, Seed, parse
 from ..data.inria import beside as cameras_beside
 from ..data.origin import ZERO, Origin
 from ..data.views import Capture, CaptureOptions, open_capture, views_for_step
@@ -46,13 +46,8 @@ class SplatData(plugin.pl.LightningDataModule):
     @dataclass(frozen=True)
     class Config(CaptureOptions):
         source: str | None = None  # capture folder, or demo:<world>; empty: cameras beside or around the splats
-        batch_size: int = 1  # views per step
-        seed: int = 0  # of the order of the views
-
-        def __post_init__(self) -> None:
-            super().__post_init__()
-            if self.batch_size < 1:
-                raise ConfigError(f"data.batch_size: got {self.batch_size}, expected 1 or more")
+        batch_size: AtLeastOne = 1  # views per step
+        seed: Seed = 0  # of the order of the views
 
     cfg: Config
 

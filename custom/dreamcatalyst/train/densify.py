@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..config import BelowOne, Count, Fraction, NonNegative
 from ..errors import SceneError
 from ..render.api import Render
 from ..scene.edit import Splats
@@ -28,18 +29,18 @@ RESET_OPACITY = 0.01  # opacities above it are brought down to it at a reset (3D
 class DensifyConfig:
     """When and how the number of splats changes. Steps count optimizer steps; lengths are fractions of the extent."""
 
-    every: int = 100  # steps between two densifications; 0: never
-    start: int = 500  # first step at which splats may be added
-    stop: int = 15000  # no splat is added or removed from this step on
-    grad_threshold: float = 2e-4  # mean screen gradient, per half image side (NDC), from which a splat is densified
-    top_fraction: float = 1.0  # of the splats with any gradient, only this fraction with the largest may be densified
-    dense_size: float = 0.01  # splats up to this size are cloned, larger ones split in two
-    min_opacity: float = 0.005  # more transparent ones are removed
-    max_size: float = 0.1  # larger ones are removed; 0: never
-    max_radius: float = 0.0  # pixels: ones that were drawn larger since the last time are removed; 0: never
-    max_splats: int = 1_000_000  # cap on editable ones (908 MiB at SH degree 3), the largest gradients go first; frozen
+    every: Count = 100  # steps between two densifications; 0: never
+    start: Count = 500  # first step at which splats may be added
+    stop: Count = 15000  # no splat is added or removed from this step on
+    grad_threshold: NonNegative = 2e-4  # mean screen gradient per half image side (NDC), from which on one is densified
+    top_fraction: Fraction = 1.0  # of the splats with any gradient, the fraction (largest first) that may be densified
+    dense_size: NonNegative = 0.01  # splats up to this size are cloned, larger ones split in two
+    min_opacity: BelowOne = 0.005  # more transparent ones are removed
+    max_size: NonNegative = 0.1  # larger ones are removed; 0: never
+    max_radius: NonNegative = 0.0  # pixels: ones that were drawn larger since the last time are removed; 0: never
+    max_splats: Count = 1_000_000  # cap on editable ones (908 MiB at SH degree 3), largest gradients go first; frozen
     # ones, which take a quarter of that each and never grow in number, do not count
-    reset_every: int = 0  # steps between two opacity resets; 0: never
+    reset_every: Count = 0  # steps between two opacity resets; 0: never
 
 
 @dataclass(frozen=True)

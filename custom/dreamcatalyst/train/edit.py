@@ -12,6 +12,7 @@ from torch import Tensor
 
 from .. import plugin
 from ..cache import ByteCache
+from ..config import Count, NonNegative
 from ..data.camera import Cameras
 from ..demo.edits import normalised
 from ..errors import ConfigError, SceneError, choose
@@ -52,15 +53,12 @@ class PromptConfig:
 class LossConfig:
     """What is minimised, as a sum of terms; the anchors' weights stand in `anchor`."""
 
-    lambda_guidance: float = 1.0  # of the rule's loss (GaussianEditor's lambda_l1 = 10 for pictures)
-    lambda_outside: float = 1.0  # of L1 to the source where a mask lets nothing change: splats must not show up there
-    lambda_perceptual: float = 0.0  # of LPIPS, for rules that deliver a picture (GaussianEditor's lambda_p = 10)
+    lambda_guidance: NonNegative = 1.0  # of the rule's loss (GaussianEditor's lambda_l1 = 10 for pictures)
+    lambda_outside: NonNegative = 1.0  # of L1 to the source where a mask lets nothing change: none may show up there
+    lambda_perceptual: NonNegative = 0.0  # of LPIPS, for rules that deliver a picture (GaussianEditor's lambda_p = 10)
     perceptual_weights: str = ""  # a folder with VGG-16's and LPIPS's weight files (loss/perceptual.py)
 
     def __post_init__(self) -> None:
-        for name in ("lambda_guidance", "lambda_outside", "lambda_perceptual"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected 0 or more.")
         if self.lambda_perceptual and not self.perceptual_weights:
             raise ConfigError(
                 "perceptual_weights: is empty. LPIPS needs the folder that holds its two weight files; or set "
@@ -82,8 +80,8 @@ def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> 
 class EditDensifyConfig(DensifyConfig):
     """Density control of an edit: the source has large splats of its own, a sky for one, which are no mistake."""
 
-    max_size: float = 0.0
-    max_splats: int = 5_000_000  # a scene of one's own may have millions to begin with; an edit adds few to them
+    max_size: NonNegative = 0.0
+    max_splats: Count = 5_000_000  # a scene of one's own may have millions to begin with; an edit adds few to them
 
 
 @plugin.register("dreamcatalyst-edit-system")
@@ -111,7 +109,7 @@ class EditSystem(SplatSystem):
         original: str = ""  # a PLY of the scene before any edit, where gs_source is an edited one; empty: gs_source
         mask: dict = field(default_factory=dict)  # where the edit may take place
         anchor: dict = field(default_factory=dict)  # what splats are held to, by generation
-        source_cache_mib: int = 1024  # what is kept of renders of the source
+        source_cache_mib: Count = 1024  # what is kept of renders of the source
 
     def configure(self) -> None:
         super().configure()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from .. import plugin
-from ..errors import ConfigError, DataError
+from ..config import Between, Count, Fraction, Range
+from ..errors import DataError
 from ..loss.image import photometric_loss
 from ..render.api import Render
 from ..scene.create import from_mesh, from_points
@@ -25,19 +26,17 @@ class FitSystem(SplatSystem):
     @dataclass
     class Config(SplatSystem.Config):
         mesh: str = ""  # a mesh or point cloud whose surface gives the first splats, instead of the capture's points
-        mesh_points: int = 50_000  # splats sampled from the mesh
-        sh_degree: int = 3  # highest degree of the colour's spherical harmonics
-        sh_every: int = 1000  # steps after which the next degree is let in
-        ssim_weight: float = 0.2  # of D-SSIM in the loss, the rest is L1
-        initial_opacity: float = 0.1
+        mesh_points: Annotated[int, Range("[1, 100000000]")] = 50_000  # splats sampled from the mesh
+        sh_degree: Annotated[int, Range("[0, 3]")] = 3  # highest degree of the colour's spherical harmonics
+        sh_every: Count = 1000  # steps after which the next degree is let in
+        ssim_weight: Fraction = 0.2  # of D-SSIM in the loss, the rest is L1
+        initial_opacity: Between = 0.1
 
     def configure(self) -> None:
         super().configure()
         self._renders: dict[int, Tensor] = {}
 
     def first_scene(self) -> Gaussians:
-        if not 0 <= self.cfg.sh_degree <= 3:
-            raise ConfigError(f"system.sh_degree: got {self.cfg.sh_degree}, expected 0, 1, 2 or 3.")
         capture = self.data.open()
         if not capture.has_photos and self.data.world is None:
             raise DataError(f"{capture.source}: has cameras but no photographs, and a fit needs some.")

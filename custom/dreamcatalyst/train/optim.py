@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ..config import Scalar, value
-from ..errors import ConfigError
+from ..config import BelowOne, Count, PositiveFraction, Rate, value
 
 GROUPS = dict(means="means", quats="quats", scales="log_scales", opacities="logit_opacities", sh0="sh0", shN="shN")
 
@@ -15,23 +14,16 @@ GROUPS = dict(means="means", quats="quats", scales="log_scales", opacities="logi
 class LearningRates:
     """Adam's learning rates; each may be a schedule. Defaults: 3DGS (Kerbl et al. 2023)."""
 
-    means: Scalar = 1.6e-4  # of the scene's extent per step
-    quats: Scalar = 1e-3
-    scales: Scalar = 5e-3  # of the logarithm
-    opacities: Scalar = 5e-2  # of the logit
-    sh0: Scalar = 2.5e-3
-    shN: Scalar = 1.25e-4
-    means_decay: float = 0.01  # the rate of the means ends at this fraction, going down geometrically over the run
-    decay: float = 1.0  # the same for all other rates
-    beta2: float = 0.999  # how long Adam remembers the size of gradients: 1 / (1 - beta2) steps
-    warm_up_steps: int = 0  # all rates grow from zero over so many steps
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.beta2 < 1:
-            raise ConfigError(f"beta2: got {self.beta2}, expected a number in [0, 1)")
-        for name in ("means_decay", "decay"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected a fraction in (0, 1]")
+    means: Rate = 1.6e-4  # of the scene's extent per step
+    quats: Rate = 1e-3
+    scales: Rate = 5e-3  # of the logarithm
+    opacities: Rate = 5e-2  # of the logit
+    sh0: Rate = 2.5e-3
+    shN: Rate = 1.25e-4
+    means_decay: PositiveFraction = 0.01  # the rate of the means ends at this fraction, geometrically over the run
+    decay: PositiveFraction = 1.0  # the same for all other rates
+    beta2: BelowOne = 0.999  # how long Adam remembers the size of gradients: 1 / (1 - beta2) steps
+    warm_up_steps: Count = 0  # all rates grow from zero over so many steps
 
     def at(self, step: int, max_steps: int, extent: float, epoch: int = 0) -> dict[str, float]:
         """The rate of each parameter (by its name in the scene) at `step` of `max_steps`. extent: world units."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from ..config import Count, DdimSteps, Number
 from ..guidance.guidance import Guidance
 from ..report.pictures import picture_row
 
@@ -15,10 +16,10 @@ from ..report.pictures import picture_row
 class PreviewConfig:
     """The grid that --preview draws: a row for each prompt, a column for each guidance scale."""
 
-    view: int | None = None  # number of the view; null: the first one held out
+    view: Count | None = None  # number of the view; null: the first one held out
     prompts: tuple[str, ...] = ()  # empty: the run's own prompt
-    guidance_scales: tuple[float, ...] = ()  # empty: the run's own scale
-    diffusion_steps: int = 20
+    guidance_scales: tuple[Number, ...] = ()  # empty: the run's own scale
+    diffusion_steps: DdimSteps = 20
 
 
 def preview_sheet(guidance: Guidance, source: Tensor, index: int, config: PreviewConfig) -> np.ndarray:

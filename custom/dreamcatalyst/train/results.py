@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
 
 from .. import plugin
+from ..config import AtLeastOne, Count, NonNegative, Range
 from ..errors import ConfigError
 from ..report.clip import ClipJudge
 from ..report.pictures import picture_row, write_png, write_video
@@ -25,23 +26,18 @@ if TYPE_CHECKING:
 class ReportConfig:
     """What is measured and written beside the result."""
 
-    every: int = 50  # steps between two rows of report/error.csv; 0: first and last step only
-    views: int = 4  # held-out views that each row is measured on
-    overhead: float = 0.025  # rows have their errors measured as long as rows take this share of the time at most
-    pictures: int = 8  # comparisons written at the end
-    video_frames: int = 72  # 0: no video
-    video_fps: int = 24
+    every: Count = 50  # steps between two rows of report/error.csv; 0: first and last step only
+    views: AtLeastOne = 4  # held-out views that each row is measured on
+    overhead: NonNegative = 0.025  # rows have their errors measured as long as rows take this share of the time at most
+    pictures: Count = 8  # comparisons written at the end
+    video_frames: Annotated[int, Range("[0, 100000]")] = 72  # 0: no video
+    video_fps: Annotated[int, Range("[1, 1000]")] = 24
     clip: str = ""  # a CLIP (folder, or id on Hugging Face) that scores an edit; empty: none
     clip_source: str = ""  # descriptions of the scene before and after, for CLIP's direction ("a photo of a bear")
     clip_target: str = ""
     aesthetic: str = ""  # the file of LAION's aesthetic predictor, for a CLIP of its width
 
     def __post_init__(self) -> None:
-        for name, least in dict(every=0, views=1, pictures=0, video_frames=0, video_fps=1).items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected {least} or more.")
-        if not self.overhead >= 0:
-            raise ConfigError(f"overhead: got {self.overhead}, expected a share of the run's time, such as 0.025.")
         for name in ("clip_source", "clip_target", "aesthetic"):
             if getattr(self, name) and not self.clip:
                 raise ConfigError(f"{name}: is for a CLIP, and none is given. Name one: report.clip=<folder or id>.")

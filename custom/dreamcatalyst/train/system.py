@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .. import plugin
+from ..config import Seed
 from ..data.camera import Cameras
 from ..data.views import Capture
 from ..diffusion.noise import keyed_generator
@@ -53,7 +54,7 @@ class SplatSystem(System):
         gs_source: str = ""  # a PLY of splats to begin with
         drop_nonfinite: bool = False  # leave NaN and Inf rows of the PLY out, instead of refusing it
         nonfinite: str = "stop"  # a step with a NaN or Inf ends the run, or is left out and counted: stop | skip
-        seed: int = 0  # of everything that is drawn at random
+        seed: Seed = 0  # of everything that is drawn at random
         renderer: dict = field(default_factory=dict)
         learning_rates: dict = field(default_factory=dict)
         densify: dict = field(default_factory=dict)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from ... import plugin
-from ...config import parse
+from ...config import AtLeastOne, Seed, Side, parse
 from ...data.views import views_for_step
 from ...demo.pairs import make_pairs, read_pairs
 from ...demo.photographs import PHOTOGRAPHS
@@ -69,14 +69,14 @@ class PriorData(plugin.pl.LightningDataModule):
     @dataclass(frozen=True)
     class Config:
         pairs: str = "outputs/pairs"  # the folder; what it lacks is made at the start
-        count: int = 8000
-        size: int = 128  # pixels, both sides
+        count: AtLeastOne = 8000
+        size: Side = 128  # pixels, both sides
         photographs: bool = True  # also pairs of the free photographs inside scikit-image and scikit-learn
-        held_out: int = 96  # pairs at least, of whole worlds, that are looked at and never trained on
-        seed: int = 0
+        held_out: AtLeastOne = 96  # pairs at least, of whole worlds, that are looked at and never trained on
+        seed: Seed = 0
 
         def __post_init__(self) -> None:
-            if not 0 < self.held_out < self.count:
+            if self.held_out >= self.count:
                 raise ConfigError(f"held_out: got {self.held_out}, expected 1 to count - 1 ({self.count - 1})")
 
     cfg: Config

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...config import AtLeastOne, Count, DdimSteps, Number
 from ...diffusion.api import Prior
 from ...diffusion.noise import keyed_noise
-from ...errors import ConfigError
 from ...guidance.replace import edit_image
 from ...report.metrics import METRICS
 from ...report.pictures import picture_row
@@ -25,16 +25,11 @@ Row = list[tuple[str, Tensor]]  # labelled pictures [H,W,3], side by side
 class SamplesConfig:
     """How held-out pairs are looked at along the way."""
 
-    every: int = 500  # steps; 0: never
-    pictures: int = 12
-    steps: int = 20  # of DDIM
-    guidance_scale: float = 4.0
-    image_guidance_scale: float = 1.5
-
-    def __post_init__(self) -> None:
-        for name, least in dict(every=0, pictures=1, steps=1).items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected {least} or more")
+    every: Count = 500  # steps; 0: never
+    pictures: AtLeastOne = 12
+    steps: DdimSteps = 20  # of DDIM
+    guidance_scale: Number = 4.0
+    image_guidance_scale: Number = 1.5
 
 
 @torch.no_grad()
@@ -44,9 +39,9 @@ def sampled_edits(
     instructions: Sequence[str],
     *,
     seed: int = 0,
-    steps: int = 20,
-    guidance_scale: float = 4.0,
-    image_guidance_scale: float = 1.5,
+    steps: DdimSteps = 20,
+    guidance_scale: Number = 4.0,
+    image_guidance_scale: Number = 1.5,
 ) -> Tensor:
     """The prior's edit of each image from noise alone, [B,3,H,W] in [0,1]. sources [B,3,H,W] in [0,1]; instructions: B
     of them. The noise of image i is a function of (seed, i)."""

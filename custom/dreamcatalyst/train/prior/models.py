@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Annotated
 
 import torch
 from torch import nn
 
+from ...config import AtLeastOne, BelowOne, Count, Fraction, NonNegative, Positive, Range
 from ...errors import ConfigError
 
 LATENTS = 4  # channels of a latent; the U-Net takes the noisy one and the image's
@@ -23,37 +25,27 @@ MEGABYTES = 24  # of weights in half precision, at most: what a repository may c
 class Stage:
     """How long and how one stage trains."""
 
-    steps: int = 1000
-    minutes: float | None = None  # ends the stage earlier, and the schedule with it; resumed bits then depend on speed
-    batch_size: int = 8
-    learning_rate: float = 1e-3  # AdamW's; warmed up, then down a cosine to zero
-    warm_up: int = 100  # steps
-    ema: float = 0.999  # of the weights that are kept, per step
-
-    def __post_init__(self) -> None:
-        for name, least in dict(steps=1, batch_size=1, warm_up=0).items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: got {getattr(self, name)}, expected {least} or more")
-        if self.minutes is not None and self.minutes <= 0:
-            raise ConfigError(f"minutes: got {self.minutes}, expected more than 0, or null for no limit")
-        if not 0 <= self.ema < 1:
-            raise ConfigError(f"ema: got {self.ema}, expected a number in [0, 1)")
+    steps: AtLeastOne = 1000
+    minutes: Positive | None = None  # ends the stage earlier, and the schedule with it; resumed bits depend on speed
+    batch_size: AtLeastOne = 8
+    learning_rate: NonNegative = 1e-3  # AdamW's; warmed up, then down a cosine to zero
+    warm_up: Count = 100  # steps
+    ema: BelowOne = 0.999  # of the weights that are kept, per step
 
 
 @dataclass(frozen=True)
 class AutoencoderConfig(Stage):
     """AutoencoderKL: an image to latents of four channels at 1/2^(levels - 1) of its sides, and back."""
 
-    channels: tuple[int, ...] = (16, 32, 64)
-    layers: int = 1  # residual blocks per level; the decoder has one more
-    groups: int = 4  # of the group norms. Few: what is constant over an image survives a norm over many channels
-    crop: int = 64  # pixels; most of the training is on crops of this side
-    whole: float = 0.3  # the last part of the stage, on whole images: a group norm sees other statistics on crops
-    kl: float = 1e-3  # weight of the divergence from a unit Gaussian, per latent element
-    gradients: float = 0.5  # weight of the error in the images' gradients, beside that of the images
+    channels: tuple[AtLeastOne, ...] = (16, 32, 64)
+    layers: AtLeastOne = 1  # residual blocks per level; the decoder has one more
+    groups: AtLeastOne = 4  # of the group norms. Few: what is constant over an image survives a norm over many channels
+    crop: AtLeastOne = 64  # pixels; most of the training is on crops of this side
+    whole: Fraction = 0.3  # the last part of the stage, on whole images: a group norm sees other statistics on crops
+    kl: NonNegative = 1e-3  # weight of the divergence from a unit Gaussian, per latent element
+    gradients: NonNegative = 0.5  # weight of the error in the images' gradients, beside that of the images
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         _divisible(self.channels, self.groups, "channels")
         if self.crop % self.factor:
             raise ConfigError(f"crop: got {self.crop}, expected a multiple of {self.factor} (the latents' factor)")
@@ -68,10 +60,14 @@ class AutoencoderConfig(Stage):
 class TextConfig:
     """CLIP's text encoder, trained from nothing together with the U-Net."""
 
-    width: int = 128
-    layers: int = 2
-    heads: int = 4
-    tokens: int = 32  # longest instruction, marks of start and end included
+    width: AtLeastOne = 128
+    layers: AtLeastOne = 2
+    heads: AtLeastOne = 4
+    tokens: Annotated[int, Range("[3, inf)")] = 32  # longest instruction, marks of start and end included
+
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            raise ConfigError(f"width: got {self.width}, expected a multiple of heads={self.heads}")
 
 
 @dataclass(frozen=True)
@@ -81,18 +77,17 @@ class UnetConfig(Stage):
     The widest level and one of half its width are both there: FreeU acts on these two.
     """
 
-    batch_size: int = 16
-    channels: tuple[int, ...] = (48, 96, 192)
+    batch_size: AtLeastOne = 16
+    channels: tuple[AtLeastOne, ...] = (48, 96, 192)
     attention: tuple[bool, ...] = (False, False, True)  # by level; the middle always attends
-    layers: int = 1
-    groups: int = 8
-    heads: int = 4
-    drop_text: float = 0.05  # Brooks et al. 2023, as the next two
-    drop_image: float = 0.05
-    drop_both: float = 0.05
+    layers: AtLeastOne = 1
+    groups: AtLeastOne = 8
+    heads: AtLeastOne = 4
+    drop_text: Fraction = 0.05  # Brooks et al. 2023, as the next two
+    drop_image: Fraction = 0.05
+    drop_both: Fraction = 0.05
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         _divisible(self.channels, self.groups, "channels")
         if len(self.attention) != len(self.channels):
             raise ConfigError(f"attention: got {len(self.attention)} levels, expected {len(self.channels)} as channels")

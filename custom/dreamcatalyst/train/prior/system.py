@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ... import plugin
+from ...config import Seed
 from ...diffusion.ip2p import InstructPix2Pix, Ip2pConfig
 from ...diffusion.noise import keyed_generator, stable_diffusion_schedule
 from ...errors import ConfigError, DataError, NumericalError
@@ -70,7 +71,7 @@ class PriorSystem(System):
 
     @dataclass
     class Config(System.Config):
-        seed: int = 0
+        seed: Seed = 0
         autoencoder: dict = field(default_factory=dict)
         text: dict = field(default_factory=dict)
         unet: dict = field(default_factory=dict)
