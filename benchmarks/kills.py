@@ -188,6 +188,8 @@ def kill_and_resume(small: Small, name: str, kills: int, draw: random.Random, sa
             result = killed(process, trial, journal, draw.randrange(1, 6), when)
         if result is not None:
             found.append(result)
+            with journal.open("a", encoding="utf-8") as file:  # what the next life goes on from was saved
+                file.write(f"done {result.step}\n" if result.step else "")
             say(f"kill {len(found)}: step {result.step}, {'inside' if result.inside else 'between'} {result.fault}")
             continue
         if process.exitcode != 0:
