@@ -7,6 +7,7 @@ import pytest
 import torch
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.errors import ConfigError
+from dreamcatalyst.scene.fitted import Fitted
 from dreamcatalyst.scene.ply import read_ply, write_ply
 from dreamcatalyst.train import results
 from dreamcatalyst.train.edit import PromptConfig
@@ -228,3 +229,17 @@ def test_learning_rates_run_geometrically_to_their_end():
 
 def test_scheduled_learning_rate():
     assert LearningRates(sh0=(0, 0.0, 1.0, 10)).at(5, 100, 1.0)["sh0"] == pytest.approx(0.5)
+
+
+def test_an_edit_finer_than_its_fit_is_refused_with_the_remedy(launch, capsys):
+    fit = launch("fit.yaml", "trainer.max_steps=2", name="fit")
+    ply = f"system.gs_source={fit / 'save' / 'last.ply'}"
+    edit = ["trainer.max_steps=1", ply]
+    launch("closed-form.yaml", *edit, "data.width=48", "data.height=48", name="finer", status=2)
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
+    assert "was fitted at 24 x 24 pixels" in line and "draws it at 48 x 48" in line and "data.max_side=48" in line
+    same = launch("closed-form.yaml", *edit, name="same")
+    for name in ("source.ply", "last.ply"):  # so that an edit of the edit knows it, too
+        assert Fitted.of(same / "save" / name) == Fitted.of(fit / "save" / "last.ply")
+    finer = ["data.width=48", "data.height=48", "system.allow_coarse_fit=true"]
+    launch("closed-form.yaml", *edit, *finer, name="allowed")

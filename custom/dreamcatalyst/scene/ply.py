@@ -7,6 +7,7 @@ written; any order, number type and byte order, and text, when read.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -62,12 +63,12 @@ def read_ply(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin =
     return _finite(path, scene, drop_nonfinite)
 
 
-def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO) -> Path:
+def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO, comments: Sequence[str] = ()) -> Path:
     """Write splats as float32 in INRIA's order, extras after them; returns the path. Folders are made as needed.
 
     Extras keep their number type (bool as uchar; int64 as uint or int where it fits; half types as float); an extra
     [N,k] becomes the k properties name_0 .. name_{k-1}. Normals are zero unless `extra` has nx, ny, nz.
-    origin: as in `read_ply`; it is added to x, y, z, which are then written as doubles.
+    origin: as in `read_ply`; it is added to x, y, z, which are then written as doubles. comments: for the header.
     The file appears under its name only when it is complete. Raises SceneError where an extra cannot be written,
     FileError where the file cannot.
     """
@@ -97,7 +98,7 @@ def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO) -> P
         before = dict(zip(MEANS, (scene.means.double().numpy() + origin).T, strict=True))
         names, core = names[len(MEANS) :], core[:, len(MEANS) :]
     with replacing(path) as part:
-        write_vertices(part, names, core, extra, before)
+        write_vertices(part, names, core, extra, before, comments)
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -63,10 +64,8 @@ def read_vertices(path: Path) -> PlyTable:
 
     Raises SceneError: no such file, not a PLY, a header that cannot be read, fewer rows than the header says.
     """
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file" if not path.is_dir() else f"{path}: is a folder, expected a PLY file")
-    with path.open("rb") as file:
-        order, elements = _header(path, file)
+    with _opened(path) as file:
+        order, elements, _ = _header(path, file)
         before = list(itertools.takewhile(lambda e: e.name != "vertex", elements))
         if len(before) == len(elements):
             found = ", ".join(e.name for e in elements) or "none"
@@ -81,23 +80,32 @@ def read_vertices(path: Path) -> PlyTable:
     return PlyTable(columns, vertex.count, {e.name: e.count for e in elements})
 
 
+def read_comments(path: Path) -> list[str]:
+    """The comments in the header of a PLY file. Raises SceneError as `read_vertices` does for a header."""
+    with _opened(path) as file:
+        return _header(path, file)[2]
+
+
 def write_vertices(
     path: Path,
     names: list[str],
     core: np.ndarray,
     extra: dict[str, np.ndarray],
     before: dict[str, np.ndarray] | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
     """Write one `vertex` element, binary little endian: the columns `before`, `core` [N, len(names)] as float, and the
-    columns `extra`."""
+    columns `extra`. comments: lines of the header, ASCII."""
     rows, before = len(core), before or {}
 
     def kinds_of(columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:
         return [(NAMES[column.dtype.str[1:]], name) for name, column in columns.items()]
 
     kinds = [*kinds_of(before), *(("float", name) for name in names), *kinds_of(extra)]
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n{}end_header\n".format(
-        rows, "".join(f"property {kind} {name}\n" for kind, name in kinds)
+    header = "ply\nformat binary_little_endian 1.0\n{}element vertex {}\n{}end_header\n".format(
+        "".join(f"comment {line}\n" for line in comments),
+        rows,
+        "".join(f"property {kind} {name}\n" for kind, name in kinds),
     )
     first, last = ([(name, "<" + c.dtype.str[1:]) for name, c in columns.items()] for columns in (before, extra))
     table = np.empty(rows, [*first, (" core", "<f4", (len(names),)), *last])
@@ -109,16 +117,24 @@ def write_vertices(
         file.write(table.view(np.uint8).data)  # `tofile` would not say why it cannot
 
 
-def _header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
+def _opened(path: Path) -> BinaryIO:
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file" if not path.is_dir() else f"{path}: is a folder, expected a PLY file")
+    return path.open("rb")
+
+
+def _header(path: Path, file: BinaryIO) -> tuple[str, list[Element], list[str]]:
+    """Byte order, elements and comments."""
     if file.readline(16).strip() != b"ply":
         raise SceneError(f"{path}: is not a PLY file (it does not begin with 'ply')")
-    order, elements = None, []
+    order, elements, comments = None, [], []
     while (line := file.readline(HEADER_LIMIT)).endswith(b"\n") and file.tell() < HEADER_LIMIT:
         words = line.decode("latin-1").split()
         if words == ["end_header"]:
             break
         try:
             if not words or words[0] in ("comment", "obj_info"):
+                comments += [" ".join(words[1:])] if words[:1] == ["comment"] else []
                 continue
             if words[0] == "format":
                 order = ORDERS[words[1]]
@@ -136,7 +152,7 @@ def _header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
         raise SceneError(f"{path}: the header has no 'end_header'; the file is truncated or not a PLY")
     if order is None:
         raise SceneError(f"{path}: the header names no format, expected one of {', '.join(ORDERS)}")
-    return order, elements
+    return order, elements, comments
 
 
 def _count(word: str) -> int:

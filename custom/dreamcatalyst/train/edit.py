@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from ..render.api import Render
 from ..report.metrics import psnr
 from ..report.pictures import write_png
 from ..scene.edit import Splats
+from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from ..scene.ply import read_ply, write_ply
 from ..segment.api import MaskConfig
@@ -107,6 +110,7 @@ class EditSystem(SplatSystem):
         prompt_processor: dict = field(default_factory=dict)
         preview: dict = field(default_factory=dict)
         original: str = ""  # a PLY of the scene before any edit, where gs_source is an edited one; empty: gs_source
+        allow_coarse_fit: bool = False  # edit splats that were fitted to smaller pictures than those of this run
         mask: dict = field(default_factory=dict)  # where the edit may take place
         anchor: dict = field(default_factory=dict)  # what splats are held to, by generation
         source_cache_mib: Count = 1024  # what is kept of renders of the source
@@ -130,7 +134,8 @@ class EditSystem(SplatSystem):
     def setup(self, stage: str) -> None:
         super().setup(stage)
         if stage == "fit":
-            write_ply(self.save_path("source.ply"), self.source.to("cpu"), origin=self.origin)
+            comments = [] if self.fitted is None else [self.fitted.comment]
+            write_ply(self.save_path("source.ply"), self.source.to("cpu"), origin=self.origin, comments=comments)
             self.compare_with_photos()
 
     def describe(self, draft: Draft) -> None:
@@ -140,6 +145,7 @@ class EditSystem(SplatSystem):
         """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""
         super().prepare()
         if self.guidance is None:
+            self.check_detail()
             words: PromptConfig = self.part["prompt_processor"]
             self.guidance = Guidance(self.part["guidance"], words.prompt, words.source_prompt, device=self.root_device)
             self.guidance.stage = self.clock.stage
@@ -159,6 +165,26 @@ class EditSystem(SplatSystem):
             whole = not (self.cfg.gs_source or self.cfg.original or self.guidance.prior.exact)
             words: PromptConfig = self.part["prompt_processor"]
             self.truth = find_truth(self.data.world if whole else None, words.prompt, self.root_device)
+
+    @cached_property
+    def fitted(self) -> Fitted | None:
+        return Fitted.of(self.cfg.gs_source) if self.cfg.gs_source else None
+
+    def check_detail(self) -> None:
+        """Refuse splats that were fitted to smaller pictures than the prior is to see: it would judge a blur."""
+        if self.fitted is None or not self.data.cfg.source or self.cfg.allow_coarse_fit:
+            return
+        capture = self.data.open(None, self.cfg.gs_source)
+        views = [capture.views[i] for i in capture.train]
+        times = self.fitted.too_coarse_for(views)
+        if times is not None:
+            fit, shown = self.fitted, Fitted.at(views)
+            side = math.ceil(max(fit.width, fit.height) * times)
+            raise ConfigError(
+                f"system.gs_source: '{self.cfg.gs_source}' was {fit.comment}, and this run draws it at {shown.width} x "
+                f"{shown.height}, focal length {shown.focal:.1f}: the prior would see it blurred. Fit it again with "
+                f"data.max_side={side} (configs/fit.yaml), or set system.allow_coarse_fit=true"
+            )
 
     def first_scene(self) -> Gaussians:
         return self.given_scene() if self.cfg.original else self.source

@@ -15,6 +15,7 @@ from ..errors import DataError
 from ..loss.image import photometric_loss
 from ..render.api import Render
 from ..scene.create import from_mesh, from_points
+from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from .system import SplatSystem
 
@@ -60,6 +61,10 @@ class FitSystem(SplatSystem):
         target = torch.stack([self.photo(i) for i in batch["index"]]).to(scene.means)
         render = self.draw(scene, self.camera(batch["index"]), sh_degree=self.sh_degree_at(step, scene))
         return photometric_loss(render.rgb, target, self.cfg.ssim_weight), render, {}
+
+    @property
+    def fitted(self) -> Fitted:
+        return Fitted.at([self.capture.views[i] for i in self.capture.train])
 
     def references(self, index: int) -> dict[str, Tensor]:
         return {"photo": self.photo(index)}

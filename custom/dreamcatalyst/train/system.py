@@ -24,6 +24,7 @@ from ..report.clock import Clock
 from ..report.metrics import compare
 from ..report.pictures import picture_row, write_png
 from ..scene.edit import Splats
+from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
 from ..scene.ply import read_ply, write_ply
@@ -367,10 +368,15 @@ class SplatSystem(System):
         """The run's report folder, beside save/."""
         return Path(self.get_save_dir()).parent / "report"
 
+    @property
+    def fitted(self) -> Fitted | None:
+        """At what size the splats were fitted, where that is known."""
+
     def write_splats(self, name: str) -> Path:
         """Write the splats of the moment as a 3DGS PLY under the save folder."""
         path = self.save_path(name)
-        write_ply(path, self.splats.scene.detach().to("cpu"), origin=self.origin)
+        comments = [] if self.fitted is None else [self.fitted.comment]
+        write_ply(path, self.splats.scene.detach().to("cpu"), origin=self.origin, comments=comments)
         return path
 
     def keep_result(self) -> None:
