@@ -58,6 +58,24 @@ def test_a_clip_scores_an_edit(launch, tmp_path):
     assert -1 <= mean["clip_direction"] <= 1 and mean["clip_similarity"] > 0.5
 
 
+def test_the_page_says_where_nothing_measures_the_edit(launch, tmp_path, capsys):
+    """A learned prior on splats of one's own has no truth: distances from the source only. An exact one knows."""
+    from tests.diffusion.small_model import make_model
+
+    told = "No figure here measures the edit"
+    learned = ["system.guidance.prior_type=ip2p", f"system.guidance.prior={{path: {make_model(tmp_path / 'ip2p')}}}"]
+    learned += ["trainer.max_steps=1", "system.prompt_processor.prompt=make it snow at the weekend"]
+    trial = launch("closed-form.yaml", *learned, name="learned")
+    assert told in (trial / "report" / "index.html").read_text() and told in capsys.readouterr().out
+    words = ["system.report.clip_source=a photo of a bear", "system.report.clip_target=a photo of a bear in snow"]
+    judged = launch(
+        "closed-form.yaml", *learned, *words, f"system.report.clip={make_clip(tmp_path / 'clip')}", name="judged"
+    )
+    exact = launch("closed-form.yaml", "trainer.max_steps=1", name="exact")
+    assert not any(told in (t / "report" / "index.html").read_text() for t in (judged, exact))
+    assert told not in capsys.readouterr().out
+
+
 def test_options_that_need_each_other(launch, capsys):
     launch("closed-form.yaml", "system.report.aesthetic=somewhere.pth", status=2)
     assert "aesthetic: is for a CLIP" in capsys.readouterr().err

@@ -26,6 +26,7 @@ h1{font-size:30px;line-height:1.2;margin:0 0 4px}h2{font-size:18px;margin:36px 0
 .tile,.card{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:12px 14px;margin:0}
 .tile b{display:block;font-size:24px;line-height:1.25;font-variant-numeric:tabular-nums}
 .tile span{color:var(--soft);font-size:13px}
+.notice{margin-top:12px}
 .charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(330px,1fr));gap:12px}
 svg{width:100%;height:auto;display:block}
 .slide{position:relative;overflow:hidden;border-radius:10px;max-width:640px;line-height:0;margin:0 auto}
@@ -67,7 +68,8 @@ class Table:
 class Page:
     """What stands on a page, from top to bottom. tiles: label to value. pictures: a row of labelled pictures [H,W,3] in
     [0,1] for each view, of which the first two are before and after. charts: those of `chart.line_chart`.
-    stages: seconds by stage. texts: headings to what stands below them, folded up."""
+    stages: seconds by stage. notice: what a reader must know of the figures. texts: headings to what stands below them,
+    folded up."""
 
     title: str
     subtitle: str
@@ -77,10 +79,12 @@ class Page:
     stages: Mapping[str, float] = field(default_factory=dict)
     tables: Mapping[str, Table] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
+    notice: str = ""
 
     def html(self) -> str:
         """The whole file."""
         body = [f"<h1>{escape(self.title)}</h1>", f'<p class="sub">{escape(self.subtitle)}</p>', _tiles(self.tiles)]
+        body += [f'<p class="card notice">{escape(self.notice)}</p>'] if self.notice else []
         shown = [[(label, data_uri(image)) for label, image in row] for row in self.pictures]
         body += [_slider(shown[0])] if shown and len(shown[0]) > 1 else []
         if charts := [f'<div class="card">{chart}</div>' for chart in self.charts if chart]:

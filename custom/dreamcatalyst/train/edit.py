@@ -145,7 +145,6 @@ class EditSystem(SplatSystem):
         """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""
         super().prepare()
         if self.guidance is None:
-            self.check_detail()
             words: PromptConfig = self.part["prompt_processor"]
             self.guidance = Guidance(self.part["guidance"], words.prompt, words.source_prompt, device=self.root_device)
             self.guidance.stage = self.clock.stage
@@ -159,6 +158,7 @@ class EditSystem(SplatSystem):
                 )
             self.perceptual = Lpips(losses.perceptual_weights, self.root_device, "system.loss.perceptual_weights")
         if self.source is None:
+            self.check_detail()
             given = self.given_scene() if not self.cfg.original else read_ply(self.cfg.original, origin=self.origin)
             self.source = given.to(self.root_device)
             # Splats of one's own are another scene, and a prior that is exact has a truth of its own.

@@ -15,8 +15,8 @@ from ..config import AtLeastOne, Count, NonNegative, Range
 from ..errors import ConfigError
 from ..report.clip import ClipJudge
 from ..report.pictures import picture_row, write_png, write_video
-from .scores import last_scores, log_scores, print_scores
-from .summary import write_report
+from .scores import last_scores, log_scores, mean_scores, print_scores
+from .summary import unmeasured, write_report
 
 if TYPE_CHECKING:
     from .system import SplatSystem
@@ -84,6 +84,8 @@ def write_all(system: SplatSystem, scores: Mapping[int, Mapping[str, float]]) ->
     video = write_video_along(system, system.save_path(f"it{step}-test.mp4"))
     written += [video] if video else []
     print_scores(scores, capture)
+    if notice := unmeasured(mean_scores(list(scores.values()))):
+        print(notice, flush=True)
     log_scores(system, scores, "test")
     for path in written:
         print(f"wrote {path}", flush=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -107,6 +107,20 @@ def score_rows(names: Sequence[str], scores: Sequence[Mapping[str, float]]) -> T
     return Table(["view", *(c.replace("_", " ") for c in columns)], cells)
 
 
+def unmeasured(columns: Iterable[str]) -> str:
+    """What a reader must know where the scores with these names compare with the source alone; else nothing."""
+    known = set(columns)
+    if not any(c.startswith("psnr_source") for c in known):
+        return ""
+    if "clip_direction" in known or any(c.startswith(("psnr_truth", "psnr_edit", "psnr_photo")) for c in known):
+        return ""
+    return (
+        "No figure here measures the edit: what it should have become is not known, and all errors are distances from "
+        "the source, in which a run that changes nothing is the best. The pictures are the judge, or CLIP's direction "
+        "(system.report.clip, clip_source, clip_target)."
+    )
+
+
 def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mapping[str, float]]) -> Page:
     """The page of a run."""
     mean, views, folder = mean_scores(list(scores.values())), system.capture.views, system.report_dir.parent
@@ -134,6 +148,7 @@ def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mappin
         charts=list(charts(system.record.curve).values()),
         stages=summary["stages"],
         tables={"Scores": score_rows([views[i].name for i in scores], list(scores.values()))} if scores else {},
+        notice=unmeasured([*mean, *system.record.curve.columns]),
         texts={**texts, "Config": config_text(system), "Machine": given["machine"], "Versions": given["versions"]},
     )
 
