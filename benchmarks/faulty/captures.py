@@ -220,7 +220,7 @@ CASES: list[Case] = [
     ),
     fit(G, "photographs renamed to .jpg", files(lambda f: rename_all(f, ".jpg")), "8 of 8 photographs are missing"),
     fit(G, "an empty photograph", files(lambda f: (f / "images/002.png").write_bytes(b"")), "002.png"),
-    fit(G, "photographs cut off at half", files(halves), ".png", "cut off"),
+    fit(G, "photographs cut off at half", files(halves), ".png", "copy it again"),
     fit(G, "a photograph that is text", files(lambda f: (f / "images/002.png").write_text("404")), "002.png"),
     fit(G, "photographs of a telephone (HEIC)", files(heic), "000.png"),
     fit(
