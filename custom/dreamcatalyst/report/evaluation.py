@@ -1,4 +1,4 @@
-"""A list of edits over scenes, and the table of what came of them in the columns of the paper."""
+"""A list of edits over scenes, the methods of the paper's table, and the table of what came of them in its columns."""
 
 from __future__ import annotations
 
@@ -13,36 +13,49 @@ from ..errors import ConfigError
 
 PAPER_PAIRS = Path(__file__).with_name("paper_pairs.yaml")
 COLUMNS = {"clip_direction": "CLIP-dir", "clip_similarity": "CLIP-img", "aesthetic": "aesthetic", "minutes": "minutes"}
-PAPER = {  # Kim et al. 2025, means over all 40 pairs; the paper does not say which CLIP, nor which views
-    "NeRF": {  # table 1
-        "IN2N": (0.157, 0.722, 5.399, 130),
-        "PDS": (0.161, 0.687, 5.437, 580),
-        "DreamCatalyst, fast": (0.165, 0.746, 5.557, 25),
-        "DreamCatalyst": (0.180, 0.746, 5.688, 70),
-        "DreamCatalyst, Psi 2": (0.178, 0.745, 5.659, 70),
-        "DreamCatalyst, Psi 3": (0.178, 0.749, 5.659, 70),
-    },
-    "3DGS": {  # table 2
-        "PDS": (0.108, 0.627, 4.977),
-        "DreamCatalyst": (0.171, 0.724, 5.336),
-        "GaussianEditor, DDS": (0.150, 0.593, 4.860),
-        "GaussianEditor, IN2N": (0.138, 0.765, 5.508),
-        "DGE": (0.154, 0.758, 5.517),
-        "GaussianEditor, DreamCatalyst": (0.152, 0.773, 5.588),
-        "GaussianEditor, DreamCatalyst fast": (0.143, 0.777, 5.541),
-    },
-}
+EVERYTHING = "everything"
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the table. name: of its folder and in the table; config: a YAML; options: further key=value. row: the
+    row of the paper's table on 3DGS that it stands for."""
+
+    name: str
+    config: str
+    options: tuple[str, ...] = ()
+    row: str = ""
+
+
+# Kim et al. 2025, table 2, without DGE; then GaussianEditor with PDS and what we recommend, which it has not.
+METHODS = (
+    Method("pds", "configs/rules/pds.yaml", row="PDS"),
+    Method("dc-splat", "configs/dc-splat.yaml", row="DreamCatalyst"),
+    Method("ge-dds", "configs/ge-dds.yaml", row="GaussianEditor, DDS"),
+    Method("ge-in2n", "configs/ge-in2n.yaml", row="GaussianEditor, IN2N"),
+    Method("dc-ge-published", "configs/dc-ge-published.yaml", row="GaussianEditor, DreamCatalyst"),
+    Method(
+        "dc-ge-published-fast",
+        "configs/dc-ge-published.yaml",
+        ("system.mode=fast",),
+        row="GaussianEditor, DreamCatalyst fast",
+    ),
+    Method("ge-pds", "configs/ge-pds.yaml"),
+    Method("dc-ge-ip2p", "configs/dc-ge-ip2p.yaml"),
+    Method("dc-ge-ip2p-fast", "configs/dc-ge-ip2p.yaml", ("system.mode=fast",)),
+)
 
 
 @dataclass(frozen=True)
 class Pair:
     """One edit. scene: the name of its folder. source, target: descriptions of the scene before and after;
-    instruction: what is to be done."""
+    instruction: what is to be done. region: what may change, in words for a mask by text, or everything."""
 
     scene: str
     source: str
     target: str
     instruction: str
+    region: str = EVERYTHING
 
     @property
     def name(self) -> str:
@@ -60,16 +73,22 @@ def read_pairs(path: Path = PAPER_PAIRS) -> list[Pair]:
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not valid YAML: {error}.") from error
     if not isinstance(given, dict) or not given:
-        raise ConfigError(f"{path}: expected scenes by name, each with source and edits, as in {PAPER_PAIRS}.")
+        raise ConfigError(f"{path}: expected scenes by name, each with source, region and edits, as in {PAPER_PAIRS}.")
     pairs = []
     for scene, entry in given.items():
         edits = entry.get("edits") if isinstance(entry, dict) else None
         if not isinstance(edits, dict) or not isinstance(entry.get("source"), str):
             raise ConfigError(f"{path}: {scene}: expected source (text) and edits (target: instruction).")
+        region = entry.get("region")
+        if not isinstance(region, str) or not region.strip():
+            raise ConfigError(
+                f"{path}: {scene}.region: got {region!r}, expected what may change, in words, or {EVERYTHING}: methods "
+                "are compared on one mask."
+            )
         for target, instruction in edits.items():
             if not isinstance(target, str) or not isinstance(instruction, str):
                 raise ConfigError(f"{path}: {scene}.edits: '{target}: {instruction}', expected text: text.")
-            pairs.append(Pair(scene, entry["source"], target, instruction))
+            pairs.append(Pair(scene, entry["source"], target, instruction, region))
     return pairs
 
 
@@ -83,26 +102,40 @@ def means(results: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return found
 
 
-def table(results: Mapping[str, Mapping[Pair, Mapping[str, float]]]) -> str:
-    """The table, as Markdown: a row of means over pairs for each method.
+def table(results: Mapping[str, Mapping[Pair, Mapping[str, float]]], unmasked: Sequence[str] = ()) -> str:
+    """The table, as Markdown: a row of means over pairs for each method, and below it what must be known to read it.
 
-    results: by method and pair, the scores. The paper's own figures stand below, marked as such, where all pairs are
-    the paper's: they say nothing about other scenes.
+    results: by method and pair, the scores. unmasked: methods that know no mask. Figures of papers do not stand here:
+    the CLIP direction of one method differs threefold between papers.
     """
-    lines = [f"| method | pairs | {' | '.join(COLUMNS.values())} |", f"|{'---|' * (len(COLUMNS) + 2)}"]
+    rows = {method.name: method.row for method in METHODS}
+    lines = [
+        f"| method | row of the paper | pairs | mask | {' | '.join(COLUMNS.values())} |",
+        f"|{'---|' * (len(COLUMNS) + 4)}",
+    ]
     for method, by_pair in results.items():
-        lines.append(_row(method, str(len(by_pair)), list(means(list(by_pair.values())).items())))
-    evaluated = {pair for by_pair in results.values() for pair in by_pair}
-    if evaluated and evaluated <= set(read_pairs()):
-        for kind, rows in PAPER.items():
-            for method, figures in rows.items():
-                found = list(zip(COLUMNS, figures, strict=False))
-                lines.append(_row(f"{method} ({kind}, as the paper reports it)", "40", found))
-    return "\n".join(lines)
+        found = means(list(by_pair.values()))
+        cells = [f"{found[c]:.{1 if c == 'minutes' else 3}f}" if c in found else "-" for c in COLUMNS]
+        mask = "none" if method in unmasked else "the list's"
+        lines.append(f"| {' | '.join([method, rows.get(method) or '-', str(len(by_pair)), mask, *cells])} |")
+    uneven = len({frozenset(by_pair) for by_pair in results.values()}) > 1
+    return "\n".join([*lines, "", *NOTES, *([UNEVEN] if uneven else [])])
 
 
-def _row(method: str, count: str, found: Sequence[tuple[str, float]]) -> str:
-    values = dict(found)
-    digits = {"minutes": 1}
-    cells = [f"{values[name]:.{digits.get(name, 3)}f}" if name in values else "-" for name in COLUMNS]
-    return f"| {method} | {count} | {' | '.join(cells)} |"
+NOTES = (
+    "Compare rows of this table with each other alone. CLIP's direction depends on which CLIP it is, on the size of "
+    "the pictures, on views and words: figures of one method differ threefold between papers.",
+    "",
+    "Methods with a mask share one for each scene, by the list's words; what they were published with may differ.",
+)
+UNEVEN = "\nRows are means over different pairs, since some runs are missing: what they have in common tells more."
+
+
+def views_note(test_every: int) -> str:
+    """What is scored."""
+    if test_every:
+        return (
+            f"Scored are the views that were held out, every {test_every}th: no method has seen them. The published "
+            "codes train on the views that they score, and so does --test-every 0."
+        )
+    return "Scored are the views that were trained on, as the published codes do; --test-every 8 holds some out."
