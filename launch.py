@@ -250,9 +250,15 @@ def make_trainer(config: Any, callbacks: list[Any], checkpoints: Any, training: 
     options["plugins"] = [*(options.get("plugins") or []), checkpoints]
     if options.get("strategy", "auto") not in SINGLE:
         raise ConfigError(f"trainer.strategy: got '{options['strategy']}', expected auto: a run is one process.")
-    for name, whole in {"limit_train_batches": (None, 1.0), "overfit_batches": (None, 0)}.items() if training else ():
-        if options.get(name) not in whole or isinstance(options.get(name), bool):
+    ends = {"limit_train_batches": (None, 1.0), "overfit_batches": (None, 0, 0.0)}  # 1 is one batch, 1.0 is all of them
+    for name, whole in ends.items() if training else ():
+        if not any(options.get(name) == value and type(options.get(name)) is type(value) for value in whole):
             raise ConfigError(f"trainer.{name}: leave it out: what ends a run is trainer.max_steps alone.")
+    interval = options.get("val_check_interval")
+    if isinstance(interval, (int, float)) and not interval > 0:
+        raise ConfigError(
+            f"trainer.val_check_interval: got {interval}, expected steps between two validations, over 0."
+        )
     where = "trainer"  # the section that is to blame
     try:
         if training and options["enable_checkpointing"]:

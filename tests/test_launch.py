@@ -226,6 +226,8 @@ def test_lightnings_own_talk_is_left_out_unless_asked_for(toy):
         (["trainer.max_steps=0"], "trainer.max_steps: got 0 (int), expected a whole number, 1 or more"),
         (["trainer.max_steps=-1"], "trainer.max_steps: got -1 (int), expected a whole number, 1 or more"),
         (["trainer.devices=2", "trainer.accelerator=cpu"], "trainer: asks for 2 processes, expected one"),
+        (["trainer.limit_train_batches=1"], "trainer.limit_train_batches: leave it out"),
+        (["trainer.val_check_interval=0"], "trainer.val_check_interval: got 0"),
         (["trainer.devices=-1", "trainer.accelerator=cpu"], "trainer: `devices` selected"),
         (["checkpoint.every_n_train_steps=often"], "checkpoint: "),
         (["seed=-1"], "seed: got -1"),
