@@ -87,6 +87,15 @@ class Small:
         if not self.ply.exists():
             write_ply(self.ply, make_world("statue").scene[::50])
 
+    def warm_up(self) -> None:
+        """Have the renderer's kernels compiled and kept on disk: the process that compiles them rounds otherwise than
+        those that load them, and is no run to compare bits with."""
+        process = processes().Process(
+            target=run, args=(self.arguments("warm", "trainer.max_steps=2"), self.folder / "w")
+        )
+        process.start()
+        process.join()
+
     def arguments(self, name: str, *more: str) -> list[str]:
         """Of a run called `name`."""
         given = ["--config", str(ROOT / "configs" / "closed-form.yaml"), "--train", f"system.gs_source={self.ply}"]
@@ -208,6 +217,7 @@ def main() -> int:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         small, faults = Small(Path(temporary)), 0
+        small.warm_up()
         kills, ended = kill_and_resume(small, "killed", args.runs, random.Random(args.seed))
         for kill in kills:
             if kill.fault:

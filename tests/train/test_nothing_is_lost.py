@@ -62,7 +62,9 @@ class Runs(kills.Small):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    return Runs(tmp_path_factory.mktemp("runs"))
+    runs = Runs(tmp_path_factory.mktemp("runs"))
+    runs.warm_up()
+    return runs
 
 
 @pytest.fixture(scope="module")
