@@ -52,10 +52,10 @@ def spoil_backward(monkeypatch, value, now):
     step_loss = EditSystem.step_loss
 
     def spoilt(self, batch, step):
-        loss, render, numbers = step_loss(self, batch, step)
+        terms, render, numbers = step_loss(self, batch, step)
         if now(self):
-            loss.register_hook(lambda gradient: gradient * value)
-        return loss, render, numbers
+            terms["guidance"].register_hook(lambda gradient: gradient * value)
+        return terms, render, numbers
 
     monkeypatch.setattr(EditSystem, "step_loss", spoilt)
 

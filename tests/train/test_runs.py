@@ -167,10 +167,10 @@ def poisoned(step_loss, at):
     """The same loss, whose gradient at step `at` is NaN."""
 
     def step(self, batch, number):
-        loss, render, numbers = step_loss(self, batch, number)
+        terms, render, numbers = step_loss(self, batch, number)
         if number == at:
-            loss.register_hook(lambda gradient: gradient * float("nan"))
-        return loss, render, numbers
+            next(iter(terms.values())).register_hook(lambda gradient: gradient * float("nan"))
+        return terms, render, numbers
 
     return step
 

@@ -9,6 +9,7 @@ from functools import partial
 
 from ..errors import choose
 from ..scene.gaussians import Gaussians
+from .additions import party_hat, rabbit_ears, scarf, with_addition
 from .coats import (
     BRONZE,
     GOLD,
@@ -34,7 +35,8 @@ class Edit:
 
     name: of the edit. scope: "object" (only the target changes) or "global". phrases: the instructions that ask for it,
     the paper's wording first. target: the thing that changes, None for global ones. weight: how often training draws
-    it. apply: World -> Gaussians, as many splats in the same order. indoors: whether it makes sense in a room.
+    it, 0 for what it was never taught. apply: World -> Gaussians, as many splats in the same order; where the edit
+    `adds` something, those of the world, to the bit, and then its own. indoors: whether it makes sense in a room.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Edit:
     target: str | None = None
     weight: float = 1.0
     indoors: bool = True
+    adds: bool = False
 
 
 def _turned_into(name: str) -> tuple[str, ...]:
@@ -128,6 +131,24 @@ def _paints() -> list[Edit]:
     ]
 
 
+def _given(a: str, name: str, more: tuple[str, ...]) -> tuple[str, ...]:
+    thing = f"{a}{name}"
+    phrases = (f"Give the bear {thing}", f"Put {thing} on the bear", f"Give the bear statue {thing}")
+    return (*phrases, f"Add {thing} to the bear", f"Add {thing}", thing.capitalize(), *more)
+
+
+def _additions() -> list[Edit]:
+    table = (
+        ("party hat", "hat", party_hat, _given("a ", "party hat", ("Make the bear wear a party hat",))),
+        ("rabbit ears", "rabbit ear", rabbit_ears, _given("", "rabbit ears", ("Give the bear the ears of a rabbit",))),
+        ("scarf", "scarf", scarf, _given("a ", "scarf", ("Make the bear wear a scarf",))),
+    )
+    return [
+        Edit(name, "object", phrases, partial(with_addition, make=make, part=part), "bear statue", 0.0, adds=True)
+        for name, part, make, phrases in table
+    ]
+
+
 HOURS_AND_SEASONS = (  # name, function, whether in a room too, phrases; the paper's wording first
     (
         "sunset",
@@ -177,6 +198,7 @@ def _table() -> dict[str, Edit]:
         for name, apply, indoors, phrases in HOURS_AND_SEASONS
     ]
     edits.append(Edit(NOTHING, "global", NO_CHANGE, lambda world: world.scene, weight=1.5))
+    edits += _additions()
     return {edit.name: edit for edit in edits}
 
 
@@ -203,7 +225,8 @@ def possible(world: World) -> list[Edit]:
 
 
 def apply_edit(world: World, name: str) -> Gaussians:
-    """The scene of `world` after the edit called `name`: as many splats, in the same order, with the same labels.
+    """The scene of `world` after the edit called `name`: as many splats, in the same order, with the same labels; an
+    edit that adds something leaves all these as they are and appends its own.
 
     Object edits leave all splats but their target's as they are, to the bit. Recolourings and global edits change sh0
     alone, so that splats can be compared one by one; the animals also move and scale the splats of some parts (ears,

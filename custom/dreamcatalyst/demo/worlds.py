@@ -35,6 +35,7 @@ BEAR = (
 STONE = {"nose": 0.55, "eye": 0.35, "muzzle": 1.08, "pedestal": 0.8}  # brightness by part, of the stone's colour
 # What a splat can belong to; the splats' extra "part" is an index into this.
 PARTS = ("floor", "sky", *dict.fromkeys(name for name, _, _ in BEAR), "wall", "tree", "ball", "box", "pot", "plant")
+PARTS += ("hat", "rabbit ear", "scarf")  # what edits add
 UPRIGHT = torch.eye(3)
 
 

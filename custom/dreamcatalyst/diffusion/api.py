@@ -17,6 +17,7 @@ PRIORS = Registry("diffusion prior", __package__)
 PRIORS.add("closed-form", ".closed_form:ClosedForm")
 PRIORS.add("ip2p", ".ip2p:InstructPix2Pix")
 PRIORS.add("sd", ".ip2p:StableDiffusion")
+PRIORS.add("world-truth", ".world_truth:WorldTruth")
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Prior(ABC):
     takes_image: whether the image condition means anything (False for text-to-image models).
     exact: whether the edit of an image is known in closed form (`known_edit`).
     draws_latents: whether latents are drawn from a posterior at every use, with noise that the caller gives.
+    takes_truth: whether it must be told what each view of a made world becomes (diffusion/world_truth.py).
     instructions: all that the prior was taught, wordings by edit; None where it is open to any.
     """
 
@@ -46,6 +48,7 @@ class Prior(ABC):
     takes_image: bool = True
     exact: bool = False
     draws_latents: bool = False
+    takes_truth: bool = False
     instructions: Mapping[str, Sequence[str]] | None = None
 
     @property
@@ -73,6 +76,10 @@ class Prior(ABC):
     @abstractmethod
     def condition(self, images: Tensor) -> Any:
         """The image condition of B images, without graph."""
+
+    def condition_of(self, images: Tensor, view: int) -> Any:
+        """The image condition of one view's source render; `view` is its number, for a prior that knows views."""
+        return self.condition(images)
 
     @abstractmethod
     def embed(self, prompts: Sequence[str]) -> list[Any]:

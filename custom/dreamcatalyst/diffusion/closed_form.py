@@ -34,9 +34,16 @@ class SourceImage:
     def __init__(self, latents: Tensor):
         self.latents = latents
         self._edited: dict[str, Tensor] = {}
+        self._known: Tensor | None = None
+
+    def assume(self, latents: Tensor) -> None:
+        """Take `latents` [B,3,H,W] for what any instruction makes of the images."""
+        self._known = latents
 
     def edited(self, operator: Operator) -> Tensor:
         """T(image) as latents [B,3,H,W]."""
+        if self._known is not None:
+            return self._known
         if operator.name not in self._edited:
             self._edited[operator.name] = 2.0 * operator((self.latents + 1.0) / 2.0) - 1.0
         return self._edited[operator.name]
@@ -47,6 +54,8 @@ class SourceImage:
         joined = SourceImage(torch.cat([part.latents for part in parts]))
         for name in set.intersection(*(set(part._edited) for part in parts)):
             joined._edited[name] = torch.cat([part._edited[name] for part in parts])
+        if all(part._known is not None for part in parts):
+            joined._known = torch.cat([part._known for part in parts])
         return joined
 
 
@@ -90,7 +99,7 @@ class ClosedForm(Prior):
 
     def with_spread(self, spread: float) -> ClosedForm:
         """The same prior with s_image = s_null = spread."""
-        return ClosedForm(replace(self.config, s_image=spread, s_null=spread), alphas_cumprod=self.alphas_cumprod)
+        return type(self)(replace(self.config, s_image=spread, s_null=spread), alphas_cumprod=self.alphas_cumprod)
 
     def embed(self, prompts: Sequence[str]) -> list[Operator | None]:
         """The operator that each instruction names; None, the identity, for an empty one."""

@@ -30,7 +30,7 @@ VIEW_BYTES = 2**30  # of latents and conditions of source views that are kept at
 class GuidanceConfig:
     """Which prior is distilled by which rule, and how strongly."""
 
-    prior_type: str = "closed-form"  # closed-form | ip2p | sd
+    prior_type: str = "closed-form"  # closed-form | ip2p | sd | world-truth
     prior: dict = field(default_factory=dict)  # the prior's own options
     rule: str = "dreamcatalyst"  # a row of guidance/rules.py
     preset: str = "paper"  # chi, delta, gamma: paper (0.075, 0.2, 0.8) | published-3dgs (0.075, 0.05, 0.2)
@@ -155,17 +155,18 @@ class Guidance:
         """Latents [1,C,h,w] (the posterior's mode, where the prior draws them at every use) and condition of a view's
         source render [H,W,3]; computed once for each `index`, as long as there is room (1 GiB)."""
         image = source.permute(2, 0, 1)[None]
-        return self._views.get(index, lambda: (self.prior.encode(image), self.prior.condition(image)))
+        return self._views.get(index, lambda: (self.prior.encode(image), self.prior.condition_of(image, index)))
 
     def forget_views(self) -> None:
         """Encode source views anew: the source is drawn otherwise from here on."""
         self._views.clear()
         self._deviations.clear()
 
-    def reduced(self, loss: Tensor) -> Tensor:
-        """Per-element terms [B,...] in the config's reduction, in balance with the rule's loss: their mean, or their
-        sum divided by the batch size."""
-        return loss.mean() if self.config.reduction == "mean" else loss.sum() / len(loss)
+    def in_balance(self, mean: Tensor, given: Step) -> Tensor:
+        """A loss that is a mean over its own elements, at the strength at which it keeps its balance with the rule's:
+        as it is beside a mean, and as many times as large as the rule's loss is beside a sum."""
+        summed = self.config.reduction == "sum" and self.rule.delivers == "gradient"
+        return mean * given.gradient[0].numel() if summed else mean
 
     def step(
         self,

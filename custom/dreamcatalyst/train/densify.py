@@ -1,6 +1,7 @@
 """Adaptive density control: where splats are added and where they go.
 
 Source: Kerbl et al. 2023, section 5.2, with the selection of a top fraction as in GaussianEditor (Chen et al. 2024).
+Candidates in empty space are ours: an edit may add a hat where nothing is that could be cloned.
 All decisions are taken on gradients of the unscaled loss, after the optimizer's step, so that no update is lost and
 neither mixed precision nor the number of views per step changes what is densified.
 """
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..config import BelowOne, Count, Fraction, NonNegative
+from ..config import BelowOne, Between, Count, Fraction, NonNegative
 from ..errors import SceneError
 from ..render.api import Render
 from ..scene.edit import Splats
@@ -41,16 +42,23 @@ class DensifyConfig:
     max_splats: Count = 1_000_000  # cap on editable ones (908 MiB at SH degree 3), largest gradients go first; frozen
     # ones, which take a quarter of that each and never grow in number, do not count
     reset_every: Count = 0  # steps between two opacity resets; 0: never
+    candidates: NonNegative = 0.0  # faint splats tried around the others each time, a fraction of the editable; 0: none
+    candidates_least: Count = 200  # but no fewer than these
+    candidates_until: Fraction = 0.7  # fraction of the run after which none is tried: a step must still judge them
+    candidate_reach: NonNegative = 0.03  # standard deviation of their distance from a parent, a fraction of the extent
+    candidate_opacity: Between = 0.05  # with which they begin: those that nothing asks for fade, and are removed
 
 
 @dataclass(frozen=True)
 class DensifyReport:
-    """What one densification did, in numbers of splats. held_back: for which max_splats left no room."""
+    """What one densification did, in numbers of splats. held_back: for which max_splats left no room; tried: candidates
+    that were added."""
 
     cloned: int = 0
     split: int = 0
     pruned: int = 0
     held_back: int = 0
+    tried: int = 0
 
 
 def screen_statistics(splats: Splats) -> dict[str, Tensor]:
@@ -108,6 +116,28 @@ def split_children(scene: Gaussians, generator: torch.Generator) -> dict[str, Te
     }
 
 
+def candidate_parents(gradient: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Indices [count] of splats, drawn with probability ~ gradient^2 [N]: where the images ask for most, and hardly
+    where there is no more than the noise that every splat sees. Drawn on the CPU. At least one gradient is not 0."""
+    cumulated = (gradient.double() / gradient.amax()).square().cpu().cumsum(0)
+    drawn = torch.rand(count, generator=generator, dtype=torch.float64) * cumulated[-1]
+    return torch.searchsorted(cumulated, drawn, right=True).clamp(max=len(gradient) - 1).to(gradient.device)
+
+
+def candidate_children(
+    scene: Gaussians, config: DensifyConfig, extent: float, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Faint round splats about each of S parents, in empty space too. Cloning and splitting stay where splats are, and
+    what an edit adds must begin where there are none: these make that space differentiable."""
+    offset = torch.randn(len(scene), 3, generator=generator).to(scene.means)
+    return {
+        "means": scene.means + offset * (config.candidate_reach * extent),
+        "log_scales": scene.log_scales.amax(-1, keepdim=True).repeat(1, 3),
+        "logit_opacities": torch.full_like(scene.logit_opacities, math.log(config.candidate_opacity))
+        - math.log1p(-config.candidate_opacity),
+    }
+
+
 @torch.no_grad()
 def densify(
     splats: Splats,
@@ -115,9 +145,10 @@ def densify(
     extent: float,
     generator: torch.Generator,
     generations: Generations | None = None,
+    explore: bool = False,
 ) -> DensifyReport:
     """Clone, split and prune the editable splats once, and start the statistics anew. extent: the scene's size in world
-    units. Children inherit all state of their parents, but are a new one of `generations`, if these are kept; anchors
+    units. explore: add candidates, too. Children inherit all state of their parents, but are a new one of `generations`, if these are kept; anchors
     and weights of all generations then move on, even where nothing was added.
 
     All editable splats may go where frozen ones are left, since an object that fades away is a valid edit. Raises
@@ -144,13 +175,21 @@ def densify(
         raise SceneError("density control would remove every splat; lower system.densify.min_opacity")
     children = split_children(scene[halved], generator)
     changed = {name: torch.cat([getattr(scene, name)[cloned], value]) for name, value in children.items()}
+    tried = max(round(config.candidates * len(scene)), config.candidates_least) if explore else 0
+    tried = min(tried, max(room - len(cloned) - len(halved), 0))
+    asked = torch.where(gone, 0.0, gradient)
+    if tried and bool(asked.any()):
+        origins = candidate_parents(asked, tried, generator)
+        new = candidate_children(scene[origins], config, extent, generator)
+        changed = {n: torch.cat([changed.get(n, getattr(scene, n)[parents]), value]) for n, value in new.items()}
+        parents = torch.cat([parents, origins])
     if generations is not None:
         changed |= generations.newborn(splats, parents, changed)
     splats.rearrange(kept, parents, changed)
     if generations is not None:
         generations.advance(splats)
     splats.state.update(screen_statistics(splats))
-    return DensifyReport(len(cloned), len(halved), int(gone.sum()), held_back)
+    return DensifyReport(len(cloned), len(halved), int(gone.sum()), held_back, tried)
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .. import plugin
 from ..cache import ByteCache
-from ..config import Count, NonNegative
+from ..config import Count, Fraction, NonNegative
 from ..data.camera import Cameras
 from ..demo.edits import normalised
 from ..errors import ConfigError, SceneError, choose
@@ -37,6 +37,7 @@ from .preview import PreviewConfig, preview_sheet
 from .system import SplatSystem
 from .truth import Truth, find_truth
 
+REGIONS = ("current", "start", "everywhere")
 PHOTO_WARNING_DB = 15.0  # below it a source render and its photograph have hardly anything in common
 
 
@@ -57,11 +58,14 @@ class LossConfig:
     """What is minimised, as a sum of terms; the anchors' weights stand in `anchor`."""
 
     lambda_guidance: NonNegative = 1.0  # of the rule's loss (GaussianEditor's lambda_l1 = 10 for pictures)
-    lambda_outside: NonNegative = 1.0  # of L1 to the source where a mask lets nothing change: none may show up there
+    region: str = "current"  # what a mask lets change of an image: current | start | everywhere (as published)
+    reach: Fraction = 0.06  # so far beyond the editable splats of the moment, a fraction of the longer side
+    lambda_outside: NonNegative = 3.0  # of L1 to the source where no editable splat is seen
     lambda_perceptual: NonNegative = 0.0  # of LPIPS, for rules that deliver a picture (GaussianEditor's lambda_p = 10)
     perceptual_weights: str = ""  # a folder with VGG-16's and LPIPS's weight files (loss/perceptual.py)
 
     def __post_init__(self) -> None:
+        choose("region", self.region, REGIONS, "region")
         if self.lambda_perceptual and not self.perceptual_weights:
             raise ConfigError(
                 "perceptual_weights: is empty. LPIPS needs the folder that holds its two weight files; or set "
@@ -77,6 +81,13 @@ def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> 
         f'"{prompt}" is nothing that this small model was taught, and what comes of it is chance. It knows, in several '
         f"wordings: {', '.join(taught)}. InstructPix2Pix is open to any instruction: configs/dc-ge-ip2p.yaml"
     )
+
+
+def widened(share: Tensor, reach: float) -> Tensor:
+    """[B,H,W,1]: the largest value within `reach` (a fraction of the longer side) of each pixel."""
+    pixels = round(reach * max(share.shape[1:3]))
+    grown = torch.nn.functional.max_pool2d(share.permute(0, 3, 1, 2), 2 * pixels + 1, stride=1, padding=pixels)
+    return grown.permute(0, 2, 3, 1)
 
 
 @dataclass(frozen=True)
@@ -164,7 +175,10 @@ class EditSystem(SplatSystem):
             # Splats of one's own are another scene, and a prior that is exact has a truth of its own.
             whole = not (self.cfg.gs_source or self.cfg.original or self.guidance.prior.exact)
             words: PromptConfig = self.part["prompt_processor"]
-            self.truth = find_truth(self.data.world if whole else None, words.prompt, self.root_device)
+            told = self.guidance.prior.takes_truth
+            self.truth = find_truth(self.data.world if whole or told else None, words.prompt, self.root_device)
+            if told and self.truth is not None:
+                self.guidance.prior.truth.image = lambda index: self.truth.image(self.draw, self.camera(index))
 
     @cached_property
     def fitted(self) -> Fitted | None:
@@ -230,6 +244,20 @@ class EditSystem(SplatSystem):
             return begun.rgb[0], begun.features[0]
         return self.draw(self.start.edited, camera, frozen=self.frozen).rgb[0], begun.features[0]
 
+    @torch.no_grad()
+    def editable_share(self, index: list[int]) -> Tensor | None:
+        """How much of each pixel of these views is of editable splats, [B,H,W,1] in [0,1]: of those of the moment, or
+        with loss.region=start of those that the run began with. None where all of all may change."""
+        losses: LossConfig = self.part["loss"]
+        if self.start is None or losses.region == "everywhere":
+            return None
+        if losses.region == "start":
+            return torch.stack([self.source_view(i)[1] for i in index])
+        scene, camera = self.splats.scene.detach(), self.camera(index)
+        share = scene.means.new_ones(len(scene), 1)
+        share[: len(scene) - len(self.splats)] = 0
+        return self.draw(scene, camera, features=share).features
+
     def source_render(self, index: int) -> Tensor:
         """The source at one view, [H,W,3], not clamped."""
         return self.source_view(index)[0]
@@ -254,27 +282,29 @@ class EditSystem(SplatSystem):
                 "data.source= left empty puts cameras around the splats"
             )
 
-    def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[Tensor, Render, dict[str, float]]:
+    def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[dict[str, Tensor], Render, dict[str, float]]:
         index, losses = batch["index"], self.part["loss"]
         render = self.draw_now(self.camera(index))
         require_finite("render", colours=render.rgb)
         views = [self.source_view(i) for i in index]
         sources, shown = torch.stack([source for source, _ in views]), render.rgb
-        if self.start is not None:  # elsewhere the prior sees the source, and asks for nothing
-            allowed = torch.stack([where for _, where in views])
-            shown = torch.lerp(sources, shown, allowed)
+        share = self.editable_share(index)
+        if share is not None:  # elsewhere the prior sees the source, and asks for nothing
+            shown = torch.lerp(sources, shown, widened(share, losses.reach if losses.region == "current" else 0.0))
         given = self.guidance.step(shown, sources, index, step, self.max_steps, batch.get("visit"))
-        loss, numbers = losses.lambda_guidance * given.loss, {"t": given.timestep, "residual": given.gradient_rms}
-        if self.start is not None and losses.lambda_outside:
-            leak = self.guidance.reduced(((1 - allowed) * (render.rgb - sources)).abs())
-            loss, numbers["outside"] = loss + losses.lambda_outside * leak, float(leak.detach())
+        numbers = {"t": given.timestep, "residual": given.gradient_rms}
+        terms = {"guidance": losses.lambda_guidance * given.loss}
+        if share is not None and losses.lambda_outside:
+            leak = self.guidance.in_balance(((1 - share) * (render.rgb - sources)).abs().mean(), given)
+            terms["outside"], numbers["outside"] = losses.lambda_outside * leak, float(leak.detach())
         if self.perceptual is not None:
             distance = self.perceptual(shown, given.target)
-            loss, numbers["perceptual"] = loss + losses.lambda_perceptual * distance, float(distance.detach())
+            terms["perceptual"] = losses.lambda_perceptual * distance
+            numbers["perceptual"] = float(distance.detach())
         if self.generations is not None:
-            pull = anchor_loss(self.splats, self.generations, self.part["anchor"])
-            loss, numbers["anchor"] = loss + pull, float(pull.detach())
-        return loss, render, numbers
+            terms["anchor"] = anchor_loss(self.splats, self.generations, self.part["anchor"])
+            numbers["anchor"] = float(terms["anchor"].detach())
+        return terms, render, numbers
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         super().on_save_checkpoint(checkpoint)

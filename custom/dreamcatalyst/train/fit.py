@@ -56,11 +56,11 @@ class FitSystem(SplatSystem):
         """The degree that has been let in by `step`."""
         return min(step // self.cfg.sh_every if self.cfg.sh_every > 0 else 3, scene.sh_degree)
 
-    def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[Tensor, Render, dict[str, float]]:
+    def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[dict[str, Tensor], Render, dict[str, float]]:
         scene = self.splats.scene
         target = torch.stack([self.photo(i) for i in batch["index"]]).to(scene.means)
         render = self.draw(scene, self.camera(batch["index"]), sh_degree=self.sh_degree_at(step, scene))
-        return photometric_loss(render.rgb, target, self.cfg.ssim_weight), render, {}
+        return {"photometric": photometric_loss(render.rgb, target, self.cfg.ssim_weight)}, render, {}
 
     @property
     def fitted(self) -> Fitted:

@@ -115,6 +115,10 @@ class Draft:
         else:
             most = f"up to {densify.max_splats:,} editable splats"
             self.add("densification", f"{times} times, every {densify.every} steps, {most}")
+            if densify.candidates:
+                self.add("candidates", "faint splats that are tried in empty space, so that an edit can add something")
+            else:
+                self.leave_out("candidates", "densify.candidates is 0: new splats come from splats that are there")
         self.leave_out("depth", "no output asks for it")
         pixels = batch * width * height
         return Plan(tuple(self.builds), tuple(self.leaves_out), self.network_rows, self.picture_rows, pixels)

@@ -44,6 +44,7 @@ CHARTS = (  # title, how its columns begin, logarithmic
     ("the rule's residual: root mean square of its gradient", "residual", True),
     ("loss", "loss", True),
     ("norms of the parameters' gradients", "norm_", True),
+    ("share of each term of the loss in the gradient", "share_", False),
     ("timestep", "t", False),
     ("splats", "splats", False),
 )

@@ -17,10 +17,11 @@ from ..data.camera import Cameras
 from ..data.views import Capture
 from ..diffusion.noise import keyed_generator
 from ..errors import ConfigError, NumericalError, SceneError, choose
+from ..loss.terms import gradient_shares, total
 from ..render.api import Backend, Render, find_backend, rasterize
 from ..render.frozen import Frozen
 from ..report.clip import ClipJudge
-from ..report.clock import Clock
+from ..report.clock import LOGGING, Clock
 from ..report.metrics import compare
 from ..report.pictures import picture_row, write_png
 from ..scene.edit import Splats
@@ -67,8 +68,8 @@ class SplatSystem(System):
         """The splats to begin with."""
         return self.given_scene()
 
-    def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[Tensor, Render, dict[str, float]]:
-        """The loss of a step, the render whose screen gradients drive densification, and numbers to report."""
+    def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[dict[str, Tensor], Render, dict[str, float]]:
+        """The loss of a step as its terms by name, the render whose screen gradients drive densification, and numbers to report."""
         raise SceneError(f"{type(self).__name__} has no training step")
 
     def references(self, index: int) -> dict[str, Tensor]:
@@ -254,11 +255,17 @@ class SplatSystem(System):
         optimizer, rates, stage = self.optimizers(), self.rates(step), self.clock.stage
         for group in self.splats.optimizer.param_groups:
             group["lr"] = rates[group["name"]]
-        loss, render, numbers = self.step_loss(batch, step)
+        terms, render, numbers = self.step_loss(batch, step)
+        loss = total(terms)
         require_finite("render", colours=render.rgb)
         require_finite("loss", loss=loss)
         render.means2d.retain_grad()
         optimizer.zero_grad()
+        if len(terms) > 1 and self.record.wanted(step + 1, self.max_steps):
+            with stage(LOGGING):
+                shares = gradient_shares(terms, self.splats.parameters)
+            render.means2d.grad = None  # what arrived there on the way is not the step's
+            numbers |= {f"share_{name}": share for name, share in shares.items()}
         with stage("backward"), torch.autocast(loss.device.type, enabled=False):  # it is for what goes forward only
             self.manual_backward(loss)
             norms = {} if self._scaler is not None else gradient_norms(self.splats.parameters)
@@ -281,7 +288,8 @@ class SplatSystem(System):
             return
         if config.every and config.start <= step < config.stop and step % config.every == 0:
             generator = keyed_generator(self.cfg.seed, "split", step)
-            done = densify(self.splats, config, self.capture.extent, generator, self.generations)
+            explore = config.candidates > 0 and step <= config.candidates_until * self.max_steps
+            done = densify(self.splats, config, self.capture.extent, generator, self.generations, explore)
             if done.held_back and not self._cap_announced:
                 self._cap_announced = True
                 plugin.warn(

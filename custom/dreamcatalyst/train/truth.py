@@ -14,14 +14,18 @@ from ..render.api import Render
 
 
 class Truth:
-    """The edit of a world that an instruction asks for. scene: the world's splats after it, in the same order."""
+    """The edit of a world that an instruction asks for. scene: the world's splats after it, in the same order, and
+    after them what the edit adds. share [N,1]: 1 for the splats that the edit is about: its target's, or where it adds
+    something, what it adds."""
 
     def __init__(self, world: World, edit: Edit, device: torch.device):
         self.edit, self.scene = edit, apply_edit(world, edit.name).to(device)
+        self.before = world.scene.to(device)
         rows = world.thing(edit.target).rows if edit.target else (0, len(world.scene))
+        if edit.adds:
+            rows = len(world.scene), len(self.scene)
         self.share = self.scene.means.new_zeros(len(self.scene), 1)
         self.share[rows[0] : rows[1]] = 1
-        self.before = world.scene.to(device)
 
     @torch.no_grad()
     def image(self, draw: Callable[..., Render], camera: Cameras) -> Tensor:
@@ -30,11 +34,13 @@ class Truth:
 
     @torch.no_grad()
     def region(self, draw: Callable[..., Render], camera: Cameras) -> Tensor | None:
-        """Where one view shows the thing that is edited, before or after: [H,W,1] of 0 and 1; None for global edits."""
+        """Where one view shows the thing that is edited, before or after (what is added: after), [H,W,1] of 0 and 1;
+        None for global edits."""
         if self.edit.target is None:
             return None
-        shares = [draw(scene, camera, features=self.share).features[0] for scene in (self.before, self.scene)]
-        return torch.maximum(*shares).round()
+        scenes = [self.scene] if self.edit.adds else [self.before, self.scene]
+        shares = [draw(scene, camera, features=self.share).features[0] for scene in scenes]
+        return torch.stack(shares).amax(0).round()
 
 
 def find_truth(world: World | None, instruction: str, device: torch.device) -> Truth | None:

@@ -1,0 +1,35 @@
+"""A loss as a sum of named terms, and how much each of them has to say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+
+def total(terms: Mapping[str, Tensor]) -> Tensor:
+    """The sum of the terms, a scalar."""
+    return torch.stack([term.reshape(()) for term in terms.values()]).sum()
+
+
+def gradient_shares(terms: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> dict[str, float]:
+    """The share of each term in the gradient, in [0,1], by its name; together 1, or all 0 where there is no gradient.
+
+    Adam divides every group of parameters by its own size, so shares are taken group by group, |grad of the term| over
+    the sum of these norms over all terms, and averaged over the groups that have a gradient. The graphs are kept.
+    """
+    used = {name: value for name, value in parameters.items() if value.numel()}
+    norms = {}
+    for name, term in terms.items():
+        if not term.requires_grad:
+            norms[name] = next(iter(used.values())).new_zeros(len(used))
+            continue
+        grads = torch.autograd.grad(term, list(used.values()), retain_graph=True, allow_unused=True)
+        norms[name] = torch.stack([term.new_zeros(()) if g is None else g.norm() for g in grads])
+    every = torch.stack(list(norms.values()))  # [terms, groups]
+    sums = every.sum(0)
+    moved = sums > 0
+    shares = every[:, moved] / sums[moved]
+    means = shares.mean(1).tolist() if bool(moved.any()) else [0.0] * len(norms)
+    return dict(zip(norms, means, strict=True))
