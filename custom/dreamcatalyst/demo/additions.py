@@ -87,4 +87,3 @@ def scarf(head: Solid, body: Solid, light: Light) -> Gaussians:
     points, normals, widths = ellipsoid(end.tolist(), (0.03, 0.05, 0.16), SPACING, turned)
     share = ((points - end) @ down / 0.32 + 0.5).clamp(0, 1)
     return Gaussians.cat([ring, painted(points, normals, widths, striped(share, RED, WHITE, 3), light)])
-

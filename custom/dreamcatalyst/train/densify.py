@@ -148,8 +148,8 @@ def densify(
     explore: bool = False,
 ) -> DensifyReport:
     """Clone, split and prune the editable splats once, and start the statistics anew. extent: the scene's size in world
-    units. explore: add candidates, too. Children inherit all state of their parents, but are a new one of `generations`, if these are kept; anchors
-    and weights of all generations then move on, even where nothing was added.
+    units. explore: try candidates, too. Children inherit all state of their parents, but are a new one of
+    `generations`, if these are kept; anchors and weights of all generations then move on, even where nothing was added.
 
     All editable splats may go where frozen ones are left, since an object that fades away is a valid edit. Raises
     SceneError, and changes nothing, where no splat at all would be left.

@@ -69,7 +69,8 @@ class SplatSystem(System):
         return self.given_scene()
 
     def step_loss(self, batch: Mapping[str, Any], step: int) -> tuple[dict[str, Tensor], Render, dict[str, float]]:
-        """The loss of a step as its terms by name, the render whose screen gradients drive densification, and numbers to report."""
+        """The terms of a step's loss by name, the render whose screen gradients drive densification, and numbers to
+        report."""
         raise SceneError(f"{type(self).__name__} has no training step")
 
     def references(self, index: int) -> dict[str, Tensor]:
