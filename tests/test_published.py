@@ -48,6 +48,7 @@ PUBLISHED = {
     "system.anchor.lambda_opacity": 5,
     "system.anchor.lambda_scale": 5,
     "system.loss.lambda_guidance": 1,
+    "system.loss.region": "everywhere",
     "system.loss.lambda_outside": 0,
     "system.loss.lambda_perceptual": 0,
     "system.learning_rates": {
