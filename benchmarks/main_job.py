@@ -3,6 +3,8 @@
 For each instruction, at held-out views and against the truth: the unedited scene, `configs/dc-ge.yaml` in both modes,
 and the ceiling: splats fitted (L1, the same steps) to the prior's own edits of the training views, each sampled once.
 Some minutes an instruction on two cores; --instructions takes some only, --table keeps what was run and goes on.
+Then the edits that add something, on the prior that knows the truth (benchmarks/growing.py), in a table of their own;
+--growing runs these alone.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "custom"))
 
+import growing  # noqa: E402
 from dreamcatalyst.demo.edits import find_edit, possible  # noqa: E402
 from dreamcatalyst.demo.worlds import make_world  # noqa: E402
 
@@ -76,16 +79,20 @@ def main() -> None:
     parser.add_argument("--source", default="demo:statue", help="a made world")
     parser.add_argument("--table", type=Path, default=Path("outputs/main_job.json"), help="results, kept and added to")
     parser.add_argument("--picture", type=Path, help="write source, result and truth of every instruction")
+    parser.add_argument("--growing", action="store_true", help="only the edits that add something")
     args = parser.parse_args()
+    if args.growing and args.instructions:
+        parser.error("--growing: has instructions of its own; leave --instructions out")
     world = make_world(args.source.removeprefix("demo:"))
-    known = [edit.phrases[0] for edit in possible(world) if edit.phrases[0]]
+    known = [edit.phrases[0] for edit in possible(world) if edit.phrases[0] and not edit.adds]
     for instruction in args.instructions or ():
-        if find_edit(instruction) not in possible(world):
+        if find_edit(instruction) not in possible(world) or find_edit(instruction).adds:
             parser.error(f"--instructions: {args.source} has no edit '{instruction}', expected wordings of: {known}")
     args.table.parent.mkdir(parents=True, exist_ok=True)
     results = json.loads(args.table.read_text(encoding="utf-8")) if args.table.exists() else {}
     rows = []
-    for instruction in args.instructions or known:
+    asked = [] if args.growing else args.instructions or known
+    for instruction in asked:
         row = results.setdefault(instruction, {})
         for name, more in RUNS.items():
             if name in row:
@@ -98,12 +105,21 @@ def main() -> None:
                     cv2.imwrite(str(args.table.with_suffix("")) + f"-{instruction.replace(' ', '_')}.png", strip)
             args.table.write_text(json.dumps(results, indent=1), encoding="utf-8")
             print(f"{instruction}, {name}: {row[name]}", file=sys.stderr, flush=True)
-    print("| instruction | unedited | high-quality | fast | ceiling | gain | below it | outside | fast | s | fast |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
-    for instruction in args.instructions or known:
+    if asked:
+        print(
+            "| instruction | unedited | high-quality | fast | ceiling | gain | below it | outside | fast | s | fast |"
+        )
+        print("|---|---|---|---|---|---|---|---|---|---|---|")
+    for instruction in asked:
         print(line(instruction, results[instruction]))
         rows.append(str(args.table.with_suffix("")) + f"-{instruction.replace(' ', '_')}.png")
-    if args.picture:
+    if not args.instructions:
+        grown = results.setdefault("growing", {})
+        growing.measure(
+            grown, args.source, lambda: args.table.write_text(json.dumps(results, indent=1), encoding="utf-8")
+        )
+        print("\n".join(["", *growing.table(grown)]))
+    if args.picture and rows:
         strips = [cv2.imread(path) for path in rows]
         cv2.imwrite(str(args.picture), np.vstack([strip[: strip.shape[0] // 4] for strip in strips]))
 
