@@ -203,7 +203,8 @@ def main() -> None:
 
     def outcome(form: str = "loss", weight: float = 0.0, scale: float = 1.0) -> Outcome:
         weights = dict(weight_init_g0=weight, weight_init=weight, max_weight=weight)
-        config = AnchorConfig(kind="source", form=form, **weights, **{f"lambda_{group}": 1.0 for group in GROUPS})
+        lambdas = {f"lambda_{group}": 1.0 for group in GROUPS}
+        config = AnchorConfig(kind="source", form=form, proximal_rate=1e-3, **weights, **lambdas)
         return run(config, source, cameras, targets, options.steps, options.noise, scale)
 
     free = outcome()

@@ -93,10 +93,10 @@ ABLATIONS: dict[str, tuple[str, ...]] = {  # of dreamcatalyst; all say what they
     "FreeU b = 1.1, skips 0.9, 0.2": freeu(1.1, 0.9, 0.2),  # the paper's factors
     "FreeU b = 1.3, skips 0.9, 0.2": freeu(1.3, 0.9, 0.2),
     "alternating noise": (f"{GUIDANCE}noise=alternating",),
-    "anchors and densification": (f"{ANCHOR}=last-densify",),
+    "anchors and densification": (f"{ANCHOR}=last-densify", "system.anchor.form=loss"),
     "proximal anchors and densification": (f"{ANCHOR}=last-densify", "system.anchor.form=proximal"),
     "no anchors, densification": (f"{ANCHOR}=none",),
-    "anchors, no densification": (f"{ANCHOR}=last-densify", f"{DENSIFY}=0"),
+    "anchors, no densification": (f"{ANCHOR}=last-densify", "system.anchor.form=loss", f"{DENSIFY}=0"),
     "no anchors, no densification": (f"{ANCHOR}=none", f"{DENSIFY}=0"),
     "mask by relevance": (f"{MASK}.kind=relevance",),
     "no mask": (f"{MASK}.kind=none",),

@@ -22,7 +22,7 @@ def config(form: str, weight: float, **changes: float) -> AnchorConfig:
     """Anchors at the source of this weight on every parameter."""
     weights = dict(weight_init_g0=weight, weight_init=weight, max_weight=weight)
     lambdas = {f"lambda_{group}": 1.0 for group in ("color", "geo", "opacity", "scale")}
-    return AnchorConfig(**{"kind": "source", "form": form, **weights, **lambdas, **changes})
+    return AnchorConfig(**{"kind": "source", "form": form, "proximal_rate": 1e-3, **weights, **lambdas, **changes})
 
 
 def held(options: AnchorConfig, dtype: torch.dtype, rounded: torch.dtype):

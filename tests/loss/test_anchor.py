@@ -12,7 +12,7 @@ from dreamcatalyst.loss.anchor import AnchorConfig, anchor_loss, anchor_step
 from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 
-ON = dict(kind="source", weight_init_g0=0.5, weight_init=0.1, weight_multiplier=2.0)
+ON = dict(kind="source", form="loss", lambda_color=5.0, weight_init_g0=0.5, weight_init=0.1, weight_multiplier=2.0)
 
 
 def moved(n: int = 4, sh_degree: int = 1, editable: torch.Tensor | None = None, **options):
@@ -92,7 +92,7 @@ def test_generations_without_splats_and_newborn_ones_add_nothing():
     loss = anchor_loss(splats, generations, config)
     assert loss.item() == 0 and not loss.requires_grad
     before = splats.scene.detach().clone()
-    anchor_step(splats, generations, AnchorConfig(**ON, form="proximal"))
+    anchor_step(splats, generations, AnchorConfig(**{**ON, "form": "proximal"}))
     assert all(torch.equal(splats.parameters[name], getattr(before, name)) for name in PARAMETERS)
 
 

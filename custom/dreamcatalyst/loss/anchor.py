@@ -31,16 +31,16 @@ class AnchorConfig:
     """What splats are held to and how strongly. A splat's weight on a parameter is W[its generation] * lambda."""
 
     kind: str = "none"  # none | last-densify (as published: slows splats down) | source (ties them to the source scene)
-    form: str = "loss"  # loss (as published) | proximal (a step of its own after the optimizer's)
+    form: str = "proximal"  # a step of its own after the optimizer's; loss: as published
     weight_init_g0: NonNegative = 0.05  # W of the splats that the run begins with
     weight_init: NonNegative = 0.1  # W of a later generation, from its second densification on; before it is 0
     weight_multiplier: NonNegative = 1.3  # on every W, at each densification
     max_weight: NonNegative = 10.0  # no W grows beyond it
-    lambda_color: NonNegative = 5.0  # SH coefficients
+    lambda_color: NonNegative = 0.0  # SH coefficients: what an edit is mostly about (published: 5)
     lambda_geo: NonNegative = 5.0  # means (world units) and quaternions
     lambda_opacity: NonNegative = 5.0  # logits
     lambda_scale: NonNegative = 5.0  # logarithms
-    proximal_rate: NonNegative = 1e-3  # c: the share of its offset that a splat of weight 1 gives up in each step
+    proximal_rate: NonNegative = 0.2  # c: the share of its offset that a splat of weight 1 gives up in each step
 
     def __post_init__(self) -> None:
         choose("anchor", self.kind, ("none", *ANCHORS), "kind")
