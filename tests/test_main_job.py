@@ -29,6 +29,7 @@ DIFFERENT = {  # the keys in which the two configs differ: what the model is, it
     "data.height",
     "system.gs_source",
     "system.prompt_processor.prompt",
+    "system.densify.candidates",
     "system.guidance.guidance_scale",
     "system.guidance.max_step_percent",
     "system.guidance.min_step_percent",
