@@ -306,11 +306,39 @@ def test_loading_makes_no_folder(written, tmp_path, monkeypatch):
         "yes",
         'a "quoted" word',
         "as it is, but {bright}",
+        "Costs ${5}",
+        "Costs ${",
+        "${HOME}",
+        "${system.seed}",
+        "a \\${b} and \\\\${",
     ],
 )
 def test_a_prompt_arrives_as_it_was_typed(written, prompt):
     config = load_config(written("name: x"), cli_args=[f"system.prompt_processor.prompt={prompt}"])
     assert config.system.prompt_processor.prompt == prompt
+
+
+def test_a_prompt_in_words_survives_all_that_reads_it_again(written, tmp_path):
+    """Where it is part of a tag, where the run's config is saved and loaded, and where a section is parsed."""
+
+    @dataclass
+    class Words:
+        prompt: str = ""
+
+    base = written("tag: x${rmspace:${system.p.prompt},_}\nsystem: {p: {prompt: a}, seed: 3, same: '${system.seed}'}")
+    config = load_config(base, cli_args=["system.p.prompt=Costs ${5}"])
+    assert config.tag == "xCosts_${5}" and config.system.same == 3
+    assert parse(Words, config.system.p).prompt == "Costs ${5}"
+    save_config(config, tmp_path / "parsed.yaml")
+    assert load_config(tmp_path / "parsed.yaml") == config
+
+
+def test_an_interpolation_may_be_typed(written):
+    base = written("tag: t\nsystem: {seed: 3}")
+    config = load_config(
+        base, cli_args=["system.a=${system.seed}", "system.b=${add:${system.seed}, 1}", "tag=a${system.seed}"]
+    )
+    assert config.system == {"seed": 3, "a": 3, "b": 4} and config.tag == "a3"
 
 
 def test_other_arguments_are_read_as_yaml(written):
@@ -323,7 +351,14 @@ def test_other_arguments_are_read_as_yaml(written):
 @pytest.mark.parametrize(
     ("text", "arguments", "said"),
     [
-        ("nmae: x", [], "config: unknown key 'nmae'. Did you mean 'name'?"),
+        ("nmae: x", [], "run.yaml: unknown key 'nmae'. Did you mean 'name'?"),
+        ("name: x", ["nmae=y"], "config: unknown key 'nmae'. Did you mean 'name'?"),
+        ("", [], "run.yaml: is empty, expected keys such as data_type"),
+        ("# nothing yet", [], "run.yaml: is empty"),
+        ("hello", [], "run.yaml: unknown key 'hello'"),
+        ("name: x", ["system..a=1"], "'system..a' is no key: a part of it is empty"),
+        ("name: x", ["system.=1"], "'system.' is no key: a part of it is empty"),
+        ("name: x", ["system.a=${system.b}"], "system.a: "),
         ("seed: x", [], "seed: got 'x' (str), expected int"),
         ("data: 3", [], "data: got 3 (int), expected dict"),
         ("name: ???", [], "name: a value is needed"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import sys
 import time
 import types
@@ -145,7 +146,7 @@ def _convert(hint: Any, raw: Any, place: str, default: Any) -> Any:
         return _ranged(hint, notes, raw, place)
     if dataclasses.is_dataclass(hint):
         return parse(hint, raw, place, default if isinstance(default, hint) else None)
-    if hint is Any or (hint is dict and isinstance(raw, DictConfig)):
+    if hint is Any or (hint is dict and isinstance(raw, DictConfig)) or (hint is str and isinstance(raw, str)):
         return raw
     if typing.get_origin(hint) in (tuple, list) and _several(raw):
         return _sequence(hint, raw, place)
@@ -345,10 +346,9 @@ def read_config(merged: DictConfig) -> ExperimentConfig:
 
     A run that resumes from `<trial>/ckpts/x.ckpt` gets that trial's folder.
     """
-    resolved = merged.copy()
-    _check_first(resolved)
+    _check_first(merged)
     try:
-        OmegaConf.resolve(resolved)
+        resolved = OmegaConf.create(_escaped(OmegaConf.to_container(merged, resolve=True)))
     except OmegaConfBaseException as error:
         reason = f"{str(error).splitlines()[0]}, in {error.child_node}"
         raise ConfigError(f"{getattr(error, 'full_key', None) or 'config'}: {reason}") from error
@@ -360,12 +360,22 @@ def load_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: A
     return read_config(merge_config(*yamls, cli_args=cli_args, **overrides))
 
 
+_SECTIONS = ("data", "system", "trainer", "checkpoint")
+
+
 def _check_first(merged: DictConfig) -> None:
     """Raise ConfigError for what other keys are worked out from, so that none of these is blamed."""
-    for key in ("data", "system", "trainer", "checkpoint"):
+    for key in _SECTIONS:
         section = OmegaConf.select(merged, key)
         if key in merged and section is not None and not isinstance(section, DictConfig):
             raise ConfigError(f"{key}: got {_show(section)}, expected dict ({key}.<key>=<value>).")
+    known = [f.name for f in dataclasses.fields(ExperimentConfig)]
+    for key in (key for key in merged if key not in known):
+        inside = [
+            f"{name}.{key}" for name in ("system", "data", "trainer", "checkpoint") if key in (merged.get(name) or ())
+        ]
+        if inside:
+            raise ConfigError(f"config: unknown key '{key}'. Did you mean '{inside[0]}'? Known: {', '.join(known)}.")
     try:
         steps = OmegaConf.select(merged, "trainer.max_steps")
     except OmegaConfBaseException:
@@ -388,7 +398,7 @@ def missing_keys(node: Any, where: str = "") -> Iterator[str]:
 def save_config(config: ExperimentConfig, path: Path, merged: DictConfig | None = None) -> None:
     """Write a config as YAML that `load_config` takes to the same trial. merged: what `config` was read from: what
     follows from other keys there is written so, and follows them again where the file is loaded with another length."""
-    told = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    told = {f.name: _escaped(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if merged is not None:
         told |= {key: value for key, value in OmegaConf.to_container(merged).items() if key not in _FOUND}
     write_text(path, OmegaConf.to_yaml(OmegaConf.create(told)))
@@ -435,14 +445,37 @@ def _read(path: Path) -> DictConfig:
         raise ConfigError(f"{place}: not valid YAML: {error.problem}.") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid YAML: {error}.") from error
-    if not isinstance(loaded, DictConfig):
-        raise ConfigError(f"{path}: got a list, expected keys such as data_type, data, system_type, system.")
+    known = [f.name for f in dataclasses.fields(ExperimentConfig)]
+    if not isinstance(loaded, DictConfig) or not loaded:
+        fault = "is empty" if loaded is not None and not len(loaded) else "got a list"
+        raise ConfigError(f"{path}: {fault}, expected keys such as data_type, data, system_type, system.")
+    for key in loaded:
+        if key not in known:
+            raise ConfigError(unknown("key", key, known, str(path)))
     return loaded
+
+
+def _is_words(text: str) -> bool:
+    """Whether there are blanks outside of all ${...}."""
+    before = None
+    while before != text:
+        before, text = text, re.sub(r"\$\{[^{}]*\}", "", text)
+    return bool(re.search(r"\s", text.strip()))
+
+
+def _escaped(node: Any) -> Any:
+    """Nested dicts, lists and texts such that OmegaConf reads every text in them as it stands, ${...} included."""
+    if isinstance(node, dict):
+        return {key: _escaped(below) for key, below in node.items()}
+    if isinstance(node, list):
+        return [_escaped(below) for below in node]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", node) if isinstance(node, str) else node
 
 
 def _dotlist(arguments: Sequence[str]) -> DictConfig:
     """`a.b=value` arguments as a config. A value is YAML where it reads as a number, list, mapping ({..}) or word such
-    as true or null, and otherwise the text as it was typed: spaces, commas, colons and apostrophes survive."""
+    as true or null, and otherwise the text as it was typed: spaces, commas, colons and apostrophes survive, and in
+    prose what begins with ${ too, which elsewhere is an interpolation."""
     config = OmegaConf.create({})
     for argument in arguments:
         key, equals, text = argument.partition("=")
@@ -451,6 +484,8 @@ def _dotlist(arguments: Sequence[str]) -> DictConfig:
                 f"'{argument}' on the command line is neither a flag nor key=value. "
                 'A value with spaces needs quotes: system.prompt_processor.prompt="Make it sunset".'
             )
+        if not all(key.split(".")):
+            raise ConfigError(f"'{argument}' on the command line: '{key}' is no key: a part of it is empty.")
         try:
             parsed = OmegaConf.create(f"value: {text}").value
         except (yaml.YAMLError, OmegaConfBaseException) as error:
@@ -460,8 +495,11 @@ def _dotlist(arguments: Sequence[str]) -> DictConfig:
         is_text = isinstance(parsed, str) and text[:1] not in ("'", '"')
         is_word = isinstance(parsed, bool) and text.lower() not in ("true", "false")
         is_prose = OmegaConf.is_config(parsed) and text[:1] not in ("[", "{")
+        value = text if is_text or is_word or is_prose else parsed
+        if isinstance(value, str) and (key.endswith("prompt") or _is_words(value)):
+            value = _escaped(value)
         try:
-            OmegaConf.update(config, key, text if is_text or is_word or is_prose else parsed, force_add=True)
+            OmegaConf.update(config, key, value, force_add=True)
         except OmegaConfBaseException as error:
             raise ConfigError(f"'{argument}' on the command line: '{key}' is no key: {error}") from error
     return config

@@ -48,7 +48,7 @@ def test_the_file_is_found_from_the_splats_that_belong_to_it(tmp_path):
     [
         ({}, "list of cameras as 3DGS writes it, got dict"),
         ([{k: v for k, v in ENTRY.items() if k != "rotation"}], "camera 0 has no 'rotation'"),
-        ([{**ENTRY, "rotation": [[1, 0], [0, 1]]}], "camera 0 holds something that is not a number or a 3x3"),
+        ([{**ENTRY, "rotation": [[1, 0], [0, 1]]}], "camera 0 has a pose that is not of 3x3 and 3 numbers"),
         ([], "empty reconstruction"),
     ],
 )

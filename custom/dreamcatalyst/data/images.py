@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import DataError
 from .lens import Lens, undistort
 
+DEFLATE = 1032  # the most that PNG's compression makes of a byte
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
@@ -57,22 +58,35 @@ def image_size(path: Path) -> tuple[int, int]:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as image:
-            return image.size
-    except (UnidentifiedImageError, OSError) as error:
+        with _any_size(), Image.open(path) as image:
+            size = image.size
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: is not an image that can be read ({error})") from error
+    _require_whole(path, size)
+    return size
+
+
+@contextmanager
+def _any_size() -> Iterator[None]:
+    """Lifts Pillow's guard against images of more than 179 megapixels: panoramas have more, and what can be decoded is
+    a question of memory (`views.require_memory`)."""
+    from PIL import Image
+
+    before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = before
 
 
 def _decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
     """RGB uint8 [H,W,3] of an image file as stored: 8 or 16 bits, grey, colour or with alpha."""
     try:
-        data = path.read_bytes()
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error) as error:
         raise DataError(f"{path}: cannot be read ({error})") from error
     if image is None:
         raise DataError(f"{path}: is damaged or not an image; copy it again")
-    _require_whole(path, data)
     if image.dtype == np.uint16:
         image = (image / 257).round().astype(np.uint8)
     if image.dtype != np.uint8:
@@ -87,14 +101,20 @@ def _decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
     return rgb
 
 
-def _require_whole(path: Path, data: bytes) -> None:
+def _require_whole(path: Path, size: tuple[int, int]) -> None:
     """Raise DataError where a PNG or JPEG was cut off: OpenCV makes up what is missing, and Pillow tells. It is asked
     only of a file that does not end as these do, such as one with a telephone's trailer."""
-    if data.startswith((b"\x89PNG", b"\xff\xd8\xff")) and not data.endswith((b"IEND\xaeB`\x82", b"\xff\xd9")):
+    with path.open("rb") as file:
+        head = file.read(8)
+        file.seek(-min(8, path.stat().st_size), os.SEEK_END)
+        tail = file.read()
+    if head.startswith(b"\x89PNG") and size[0] * size[1] > 8 * DEFLATE * path.stat().st_size:
+        raise DataError(f"{path}: is cut off or damaged: so few bytes do not hold {size[0]}x{size[1]} pixels")
+    if head.startswith((b"\x89PNG", b"\xff\xd8\xff")) and not tail.endswith((b"IEND\xaeB`\x82", b"\xff\xd9")):
         from PIL import Image
 
         try:
-            with Image.open(io.BytesIO(data)) as image:
+            with _any_size(), Image.open(path) as image:
                 image.load()
         except (OSError, SyntaxError) as error:
             raise DataError(f"{path}: is cut off or damaged ({error}); copy it again") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ def find(source: Path) -> Path | None:
 def beside(splats: Path) -> Path | None:
     """The cameras.json of the 3DGS run that wrote this PLY: in its folder or up to two above
     (<run>/point_cloud/iteration_30000/point_cloud.ply)."""
+    if splats.is_symlink() and not splats.exists():  # such as one that leads to itself
+        return None
     return next((path for folder in list(splats.resolve().parents)[:3] if (path := find(folder)) is not None), None)
 
 
@@ -36,15 +39,20 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 
 
 def _shot(path: Path, index: int, entry: dict) -> Shot:
+    if not isinstance(entry, dict):
+        raise DataError(f"{path}: camera {index} is {entry!r}, expected an object with {', '.join(KEYS)}")
     missing = [key for key in KEYS if key not in entry]
     if missing:
         raise DataError(f"{path}: camera {index} has no '{missing[0]}' (found {', '.join(entry)})")
     try:
         rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)
         position = np.array(entry["position"], np.float64).reshape(3)
-        width, height, fx, fy = int(entry["width"]), int(entry["height"]), float(entry["fx"]), float(entry["fy"])
     except (TypeError, ValueError) as error:
-        raise DataError(f"{path}: camera {index} holds something that is not a number or a 3x3 ({error})") from None
+        raise DataError(f"{path}: camera {index} has a pose that is not of 3x3 and 3 numbers ({error})") from None
+    for key in ("width", "height", "fx", "fy"):
+        if not isinstance(entry[key], (int, float)) or isinstance(entry[key], bool) or not math.isfinite(entry[key]):
+            raise DataError(f"{path}: camera {index}: '{key}' is {entry[key]!r}, expected a number")
+    width, height, fx, fy = int(entry["width"]), int(entry["height"]), float(entry["fx"]), float(entry["fy"])
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ position
     name = str(entry.get("img_name", f"{index:05d}"))

@@ -8,11 +8,15 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from ..config import Range
 from ..errors import DataError
 
 # Zooms tried for the pinhole view of a distorted photograph, narrowest first. Below 1/2 the middle of a wide fisheye
 # would keep less than half of its resolution for the sake of stretched corners.
 ZOOMS = np.geomspace(4.0, 0.5, 600)
+FINITE, FOCAL = Range("(-1e9, 1e9)"), Range("(1e-3, 1e9)")  # pixels; float32 holds their squares
+SIDE = Range("[1, 1048576]")  # pixels; OpenCV reads no longer ones
+LIMITS = {"fx": FOCAL, "fy": FOCAL, "cx": FINITE, "cy": FINITE, "width": SIDE, "height": SIDE}
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,15 @@ class Lens:
     height: int
     distortion: tuple[float, ...] = ()
     fisheye: bool = False
+
+    def check(self, where: str) -> None:
+        """Raise DataError for a number that no lens has. where: whose lens it is, for the message."""
+        for name, limits in LIMITS.items():
+            if getattr(self, name) not in limits:
+                what = {"f": "focal length ", "c": "principal point "}.get(name[0], "")
+                raise DataError(f"{where}: {what}{name} is {getattr(self, name)}, expected {limits}")
+        if not all(value in FINITE for value in self.distortion):
+            raise DataError(f"{where}: the distortion {self.distortion} is not of finite numbers")
 
     @property
     def distorted(self) -> bool:

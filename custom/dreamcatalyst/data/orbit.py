@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..errors import DataError, choose
+from ..errors import DataError
 from .camera import Cameras, look_at
-from .views import Capture, CaptureOptions, View, fit, split
+from .views import AXES, Capture, CaptureOptions, View, fit, split
 
-AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")}  # what data.orbit_up may name
 SIZE = 512  # pixels of an orbit's square images
 FOV = 50.0  # degrees, of an image's shorter side
 # Half of the splats lie within the median distance. It is 0.79 of the radius of a full ball, which so takes 4/5 of the
@@ -40,9 +39,9 @@ def orbit_capture(scene: Splats, options: CaptureOptions) -> Capture:
     image; the median leaves stray splats and far background aside. Which way is up is not in the splats:
     options.orbit_up says it, by default -y, as COLMAP's worlds are when the first photograph was held upright
     (OpenCV's y is down); nerfstudio's exports have z. Raises DataError for zero splats or fully
-    transparent ones, ConfigError for an unknown axis.
+    transparent ones.
     """
-    axis = choose("axis", options.orbit_up, AXES, "data.orbit_up")
+    axis = options.orbit_up
     if len(scene.means) == 0:
         raise DataError("data: zero splats have no middle to go round; name a capture with data.source")
     opacity = scene.opacities.detach().cpu().double()

@@ -10,15 +10,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..config import Range
 from ..errors import DataError, unknown
 from .images import SUFFIXES, image_size
-from .lens import Lens
+from .lens import FINITE, FOCAL, SIDE, Lens
 from .views import CaptureOptions, Format, Points, Scan, Shot, read_json
 
 NAME = "transforms.json"
 FISHEYE = {"OPENCV_FISHEYE"}
 MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", *FISHEYE}
-NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x", "camera_angle_y")
+NUMBERS = {
+    **dict.fromkeys(("w", "h"), SIDE),
+    **dict.fromkeys(("fl_x", "fl_y"), FOCAL),
+    **dict.fromkeys(("camera_angle_x", "camera_angle_y"), Range("(0, 3.1416)")),  # radians, of the whole side
+    **dict.fromkeys(("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"), FINITE),
+}
+POSITIVE = Range("(0, inf)")
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: y up, z backward -> y down, z forward
 
 
@@ -61,8 +68,8 @@ def splats_from_capture(dataparser: str | Path, source: Path) -> Tensor:
     meta = meta if isinstance(meta, dict) else {}
     applied = _matrix(meta.get("applied_transform", np.eye(4)), f"{source}: applied_transform")
     out = _matrix(saved["transform"], f"{path}: transform") @ np.linalg.inv(applied)
-    applied_scale = _number(meta.get("applied_scale", 1.0), "applied_scale", str(source))
-    out[:3] *= _number(saved["scale"], "scale", str(path)) / applied_scale
+    applied_scale = _number(meta.get("applied_scale", 1.0), "applied_scale", str(source), POSITIVE)
+    out[:3] *= _number(saved["scale"], "scale", str(path), POSITIVE) / applied_scale
     return torch.from_numpy(out)
 
 
@@ -73,6 +80,8 @@ def _shot(path: Path, meta: dict, index: int, frame: dict) -> Shot:
     for key in ("file_path", "transform_matrix"):
         if key not in frame:
             raise DataError(f"{where} has no '{key}' (found {', '.join(frame) or 'nothing'})")
+    if not isinstance(frame["file_path"], str) or "\0" in frame["file_path"]:
+        raise DataError(f"{where}: 'file_path' is {frame['file_path']!r}, expected the path of a photograph")
     photo = _photo(path.parent / frame["file_path"])
     camera_to_world = _matrix(frame["transform_matrix"], f"{where}, transform_matrix") @ OPENGL_TO_OPENCV
     name = Path(frame["file_path"]).as_posix()
@@ -89,10 +98,10 @@ def _photo(path: Path) -> Path:
 
 def _lens(meta: dict[str, Any], where: str, photo: Path) -> Lens:
     model = meta.get("camera_model", "OPENCV_FISHEYE" if meta.get("is_fisheye") else "OPENCV")
-    if model not in MODELS:
+    if not isinstance(model, str) or model not in MODELS:
         raise DataError(unknown("camera_model", model, MODELS, where))
     size = image_size(photo) if photo.is_file() else (1, 1)  # a missing photograph gets its own error later
-    meta = {key: _number(value, key, where) for key, value in meta.items() if key in NUMBERS}
+    meta = {key: _number(value, key, where, NUMBERS[key]) for key, value in meta.items() if key in NUMBERS}
     width, height = int(meta.get("w", size[0])), int(meta.get("h", size[1]))
     fx, fy = _focal(meta, "x", width), _focal(meta, "y", height)
     if fx is None and fy is None:
@@ -113,11 +122,14 @@ def _lens(meta: dict[str, Any], where: str, photo: Path) -> Lens:
     )
 
 
-def _number(value: Any, key: str, where: str) -> float:
+def _number(value: Any, key: str, where: str, limits: Range) -> float:
     try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise DataError(f"{where}: '{key}' is {value!r}, expected a number") from None
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError(f"{where}: '{key}' is {str(value)[:80]!r}, expected a number") from None
+    if number not in limits:
+        raise DataError(f"{where}: '{key}' is {value!r}, expected {limits}")
+    return number
 
 
 def _focal(meta: dict[str, float], axis: str, size: int) -> float | None:
@@ -134,8 +146,10 @@ def _matrix(value: Any, where: str) -> np.ndarray:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError):
         matrix = np.empty(0)
-    if matrix.shape not in ((3, 4), (4, 4)):
-        raise DataError(f"{where}: expected a matrix of 3x4 or 4x4 numbers")
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise DataError(f"{where}: expected a matrix of 3x4 or 4x4 finite numbers")
+    if not abs(np.linalg.det(matrix[:3, :3])) > 1e-12:
+        raise DataError(f"{where}: is no rotation and scale: it makes everything flat")
     return np.concatenate([matrix[:3], [[0, 0, 0, 1.0]]])
 
 
@@ -145,6 +159,8 @@ def _points(path: Path, meta: dict) -> Points | None:
         return None
     import trimesh
 
+    if not isinstance(meta["ply_file_path"], str):
+        raise DataError(f"{path}: 'ply_file_path' is {meta['ply_file_path']!r}, expected the path of a point cloud")
     cloud_path = path.parent / meta["ply_file_path"]
     if not cloud_path.is_file():
         raise DataError(f"{path}: its ply_file_path {cloud_path} is missing; remove the key to do without points")

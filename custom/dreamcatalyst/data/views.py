@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -15,7 +16,8 @@ import torch
 from torch import Tensor
 
 from ..config import AtLeastOne, Colour, Count, NonNegative, Range, Side
-from ..errors import DataError
+from ..errors import DataError, choose
+from ..memory import free_memory
 from ..registry import Registry
 from .camera import Cameras
 from .images import ImageCache, Photo, image_size
@@ -26,6 +28,9 @@ FORMATS = Registry("dataset format", __package__)
 FORMATS.add("colmap", ".colmap:FORMAT")
 FORMATS.add("inria", ".inria:FORMAT")
 FORMATS.add("nerfstudio", ".transforms:FORMAT")
+
+
+AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")}  # what data.orbit_up may name
 
 
 @dataclass(frozen=True)
@@ -47,9 +52,19 @@ class CaptureOptions:
     orbit_up: str = "-y"  # x, y, z, -x, -y or -z: which way is up in them; -y suits COLMAP's worlds, z nerfstudio's
 
     def __post_init__(self) -> None:
+        if self.format is not None:
+            choose("format", self.format, FORMATS.names(), "data.format")
+        choose("axis", self.orbit_up, AXES, "data.orbit_up")
         sized = self.width is not None or self.height is not None
         if self.downscale != 1 and sized:
             raise DataError("data.downscale and data.width or data.height: both set a size; leave one of them out")
+
+
+LONGEST = 32766  # pixels of a view's side; OpenCV resamples no longer ones
+SMALLER = "Set data.max_side or data.downscale"
+FARTHEST = 1e15  # world units; float32 holds its square
+DECODED, UNDISTORTED = 12, 24  # bytes per pixel of a photograph at most while it is decoded, and undistorted
+DRAWN = 100  # bytes per pixel of a view at least: its render, gradients, photograph and loss in float32
 
 
 class Points(NamedTuple):
@@ -137,9 +152,13 @@ class Capture:
 
     @property
     def training_cameras(self) -> Cameras:
-        """The training cameras as one batch, for a path among them: where image sizes differ, all get the commonest
-        size and the median intrinsics of its cameras."""
-        cameras = [self.views[i].camera for i in self.train]
+        """The training cameras as one batch, for a path among them."""
+        return self.poses(self.train)
+
+    def poses(self, indices: Iterable[int]) -> Cameras:
+        """The cameras of these views as one batch whatever their image sizes, for what asks where they stand: where
+        sizes differ, all get the commonest one and the median intrinsics of its cameras."""
+        cameras = [self.views[i].camera for i in indices]
         (width, height), count = Counter((c.width, c.height) for c in cameras).most_common(1)[0]
         if count == len(cameras):
             return Cameras.cat(cameras)
@@ -253,7 +272,7 @@ def views_for_step(seed: int, step: int, n_views: int, batch: int = 1) -> list[i
 def read_json(path: Path) -> Any:
     """A JSON file's content. Raises DataError where it cannot be read."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({error})") from error
 
@@ -263,10 +282,31 @@ def _check(source: Path, shots: list[Shot]) -> None:
     if missing:
         count = f"{len(missing)} of {len(shots)} photographs are missing"
         raise DataError(f"{source}: {count}, first '{missing[0].path}'. Put them there, or set data.images")
+    _require_different(source, shots)
     for shot in shots:
+        shot.lens.check(f"{source}: the camera of '{shot.name}'")
         rotation = shot.viewmat[:3, :3]
+        if not (np.abs(shot.viewmat) < FARTHEST).all():
+            raise DataError(f"{source}: the pose of '{shot.name}' is not of finite numbers")
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2) or not np.linalg.det(rotation) > 0:
             raise DataError(f"{source}: the pose of '{shot.name}' is not a rotation and a translation")
+
+
+def _require_different(source: Path, shots: list[Shot]) -> None:
+    """Raise DataError where one photograph stands there twice, under one name or as two files: what is held out would
+    also be trained on."""
+    paths: dict[Path, Shot] = {}
+    poses: dict[bytes, list[Shot]] = {}
+    for shot in shots:
+        if shot.path is None:
+            continue
+        alike = [paths.get(shot.path.resolve()), *poses.get(shot.viewmat.tobytes(), ())]
+        other = next((o for o in alike if o and (o.path == shot.path or filecmp.cmp(o.path, shot.path, False))), None)
+        if other is not None:
+            names = f"'{shot.name}'" if other.name == shot.name else f"'{other.name}' and '{shot.name}'"
+            raise DataError(f"{source}: the photograph {names} is there twice. Take one out: one may be held out")
+        paths[shot.path.resolve()] = shot
+        poses.setdefault(shot.viewmat.tobytes(), []).append(shot)
 
 
 def _recentred(shots: list[Shot], points: Points | None) -> tuple[list[Shot], Points | None, Origin]:
@@ -287,6 +327,9 @@ def _recentred(shots: list[Shot], points: Points | None) -> tuple[list[Shot], Po
 
 def _view(shot: Shot, options: CaptureOptions) -> View:
     lens = shot.lens if shot.path is None else _at_file_size(shot)
+    if shot.path is not None:
+        each, size = UNDISTORTED if lens.distorted else DECODED, f"{lens.width}x{lens.height}"
+        require_memory(lens.width * lens.height * each, f"{shot.path}: {size} pixels", "Make smaller copies")
     window, width, height = fit(lens.width, lens.height, options)
     K, viewmat = torch.from_numpy(lens.pinhole().K), torch.from_numpy(shot.viewmat)
     camera = Cameras(viewmat[None], K[None], lens.width, lens.height).cropped(*window).resized(width, height)
@@ -306,8 +349,25 @@ def _at_file_size(shot: Shot) -> Lens:
     return lens.scaled(width, height)
 
 
+def require_memory(needed: float, what: str, remedy: str) -> None:
+    """Raise DataError where `needed` bytes are more than are free."""
+    free = free_memory()
+    if needed > free:
+        raise DataError(f"{what} need {needed / 2**30:.1f} GiB, and {free / 2**30:.1f} GiB are free. {remedy}.")
+
+
 def fit(width: int, height: int, options: CaptureOptions) -> tuple[tuple[int, int, int, int], int, int]:
-    """The window (left, top, width, height) of an image that is shown, and the width and height it is resized to."""
+    """The window (left, top, width, height) of an image that is shown, and the width and height it is resized to.
+
+    Raises DataError for a size that memory does not hold."""
+    window, *size = _fit(width, height, options)
+    if max(size) > LONGEST:
+        raise DataError(f"data: views of {size[0]}x{size[1]} pixels, expected {LONGEST} a side at most. {SMALLER}.")
+    require_memory(size[0] * size[1] * DRAWN, f"data: views of {size[0]}x{size[1]} pixels", SMALLER)
+    return window, *size
+
+
+def _fit(width: int, height: int, options: CaptureOptions) -> tuple[tuple[int, int, int, int], int, int]:
     if options.width is None and options.height is None:
         smaller = options.downscale
         if smaller == 1 and options.max_side is not None:

@@ -7,7 +7,6 @@ any scene is loaded.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import PriorError
+from ..memory import free_memory
 
 T = TypeVar("T")
 
@@ -215,16 +215,6 @@ def _check_channels(folder: Folder, conditioned: bool) -> None:
         f"{folder.path / 'unet'}: takes {got} channels and gives {out}, expected {wanted} and {latent} "
         f"({'noisy latents and image latents' if conditioned else 'noisy latents'}). {remedy}"
     )
-
-
-def free_memory(device: torch.device) -> float:
-    """Bytes that can still be had on `device`; infinite where nobody can say."""
-    if device.type != "cpu":
-        ask = getattr(torch.get_device_module(device), "mem_get_info", None)
-        return ask(device)[0] if ask else math.inf
-    info = Path("/proc/meminfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), math.inf)
 
 
 def check_memory(folder: Folder, dtype: torch.dtype, device: torch.device, *, offload: bool, tiny: bool) -> None:

@@ -41,7 +41,8 @@ def write_png(path: Path, pixels: np.ndarray) -> Path:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> Path:
-    """Write uint8 RGB frames of one size as H.264 in yuv420p; odd sides lose their last row or column.
+    """Write uint8 RGB frames of one size as H.264 in yuv420p; odd sides lose their last row or column, and a side of
+    one pixel is doubled.
 
     Raises FileError.
     """
@@ -52,7 +53,13 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> Path
             part, fps=fps, codec="libx264", quality=8, macro_block_size=2, pixelformat="yuv420p"
         ) as out:
             for frame in frames:
-                out.append_data(np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]))
+                out.append_data(_even(frame))
         with imageio.get_reader(part) as made:  # where the disk is full, the writer says nothing
             made.get_data(0)
     return path
+
+
+def _even(frame: np.ndarray) -> np.ndarray:
+    """The frame with even sides."""
+    frame = frame.repeat(1 + (frame.shape[0] == 1), axis=0).repeat(1 + (frame.shape[1] == 1), axis=1)
+    return np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])

@@ -21,6 +21,7 @@ from .gaussians import SH_C0, Gaussians
 from .plyfile import PlyTable, read_vertices, write_vertices
 
 MEANS, NORMALS, DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
+FARTHEST, LARGEST_LOG = 1e15, 40.0  # world units; beyond, float32 does not hold the squares
 SCALES, QUATS, RGB = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)], ["red", "green", "blue"]
 
 
@@ -61,6 +62,18 @@ def read_ply(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin =
         extra=extra,
     )
     return _finite(path, scene, drop_nonfinite)
+
+
+def read_splats(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin = ZERO) -> Gaussians:
+    """`read_ply` of splats that are to be drawn: also without positions and scales whose squares float32 does not hold,
+    as they come of files whose scale_* are no logarithms. Raises SceneError, or leaves such splats out."""
+    path = Path(path)
+    scene = read_ply(path, drop_nonfinite=drop_nonfinite, origin=origin)
+    far = (scene.means.double() + torch.tensor(origin, dtype=torch.float64)).abs() > FARTHEST
+    scene = _without(path, scene, far.any(dim=1), f"positions beyond {FARTHEST:g}", drop_nonfinite)
+    large = (scene.log_scales > LARGEST_LOG).any(dim=1)
+    fault = f"scales beyond exp({LARGEST_LOG:g}), though scale_* are logarithms,"
+    return _without(path, scene, large, fault, drop_nonfinite)
 
 
 def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO, comments: Sequence[str] = ()) -> Path:
@@ -163,18 +176,23 @@ def _finite(path: Path, scene: Gaussians, drop: bool) -> Gaussians:
     bad = torch.zeros(len(scene), dtype=torch.bool)
     for _, value in scene.parameters():
         bad |= ~value.flatten(1).isfinite().all(dim=1) if value.ndim > 1 else ~value.isfinite()
+    return _without(path, scene, bad, "NaN or infinite parameters", drop)
+
+
+def _without(path: Path, scene: Gaussians, bad: Tensor, fault: str, drop: bool) -> Gaussians:
+    """The scene without the splats `bad` [N] bool; raises SceneError where they are not to be dropped."""
     count = int(bad.sum())
     if count == 0:
         return scene
     if not drop:
         first = int(bad.nonzero()[0, 0])
         raise SceneError(
-            f"{path}: {count} of {len(scene)} splats have NaN or infinite parameters (first: row {first}). "
+            f"{path}: {count} of {len(scene)} splats have {fault} (first: row {first}). "
             "system.drop_nonfinite=true leaves them out"
         )
     if count == len(scene):
-        raise SceneError(f"{path}: all {count} splats have NaN or infinite parameters; nothing is left")
-    print(f"{path}: {count} of {len(scene)} splats with NaN or infinite parameters left out")
+        raise SceneError(f"{path}: all {count} splats have {fault}; nothing is left")
+    print(f"{path}: {count} of {len(scene)} splats with {fault} left out")
     return scene[~bad]
 
 

@@ -49,7 +49,7 @@ class Element:
     def add(self, name: str, code: str) -> None:
         """Append a property. Raises KeyError where the name is taken."""
         if name in self.properties:
-            raise KeyError(name)
+            raise KeyError(f"property '{name}' is there twice")
         self.properties[name] = code
 
     def dtype(self, path: Path, order: str) -> np.dtype:
@@ -71,6 +71,8 @@ def read_vertices(path: Path) -> PlyTable:
             found = ", ".join(e.name for e in elements) or "none"
             raise SceneError(f"{path}: has no element 'vertex' (found {found}), so it holds no splats")
         vertex = elements[len(before)]
+        if not vertex.properties:
+            raise SceneError(f"{path}: its element 'vertex' has no properties, so it holds no splats")
         if order:
             skip = sum(e.count * e.dtype(path, order).itemsize for e in before)
             table = _binary(path, file, vertex, vertex.dtype(path, order), skip)
@@ -146,8 +148,9 @@ def _header(path: Path, file: BinaryIO) -> tuple[str, list[Element], list[str]]:
                 elements[-1].add(words[2], (TYPES | ALIASES)[words[1]])
             else:
                 raise KeyError(words[0])
-        except (KeyError, IndexError, ValueError):
-            raise SceneError(f"{path}: cannot read the header line '{' '.join(words)}'") from None
+        except (KeyError, IndexError, ValueError) as error:
+            reason = f": {error.args[0]}" if isinstance(error, KeyError) and " " in str(error.args[0]) else ""
+            raise SceneError(f"{path}: cannot read the header line '{' '.join(words)[:80]}'{reason}") from None
     else:
         raise SceneError(f"{path}: the header has no 'end_header'; the file is truncated or not a PLY")
     if order is None:
@@ -169,6 +172,10 @@ def _binary(path: Path, file: BinaryIO, vertex: Element, dtype: np.dtype, skip: 
 
 
 def _text(path: Path, file: BinaryIO, vertex: Element, skip: int) -> np.ndarray:
+    # In text a number takes two bytes at least, its blank included, and every row but the last a line's end.
+    held = (path.stat().st_size - file.tell() + 1) // max(2 * len(vertex.properties), 1)
+    if held < vertex.count:
+        raise SceneError(_truncated(path, vertex.count, f"no more than {held}"))
     table = np.empty(vertex.count, vertex.dtype(path, "="))
     if vertex.count == 0:
         return table
@@ -186,5 +193,5 @@ def _text(path: Path, file: BinaryIO, vertex: Element, skip: int) -> np.ndarray:
     return table
 
 
-def _truncated(path: Path, expected: int, got: int) -> str:
+def _truncated(path: Path, expected: int, got: int | str) -> str:
     return f"{path}: is truncated: the header promises {expected} splats, the file holds {got}. Copy or export it again"

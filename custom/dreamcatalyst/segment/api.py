@@ -129,7 +129,7 @@ def make_mask(config: MaskConfig, request: MaskRequest, folder: Path | None = No
         return None
     folder = Path(config.cache).expanduser() if config.cache else folder
     key = cache.digest(cache.code(), *_made_of(config, segmenter, request)) if folder else ""
-    found = cache.load(folder, key) if folder else None
+    found = cache.load(folder, key, len(request.scene)) if folder else None
     if found is None:
         found = _find(config, segmenter, request)
         if folder:

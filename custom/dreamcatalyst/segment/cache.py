@@ -65,15 +65,15 @@ def save(folder: Path, key: str, weights: Tensor, images: Mapping[int, Tensor]) 
     files.save(folder / f"{key}.pt", {"key": key, "weights": weights.cpu(), "images": dict(images)})
 
 
-def load(folder: Path, key: str) -> tuple[Tensor, dict[int, Tensor]] | None:
-    """What `save` kept under `key`; None where there is nothing. A file that is not to the bit what was written, or not
-    what its name says, is reported and left aside, to be written anew."""
+def load(folder: Path, key: str, count: int) -> tuple[Tensor, dict[int, Tensor]] | None:
+    """What `save` kept under `key` of `count` splats; None where there is nothing. A file that is not to the bit what
+    was written, or not what its name says, is reported and left aside, to be written anew."""
     path = folder / f"{key}.pt"
     if not path.is_file():
         return None
     try:
         kept, _ = files.load(path)
-        if not _is_mask(kept) or kept["key"] != key:
+        if not _is_mask(kept, count) or kept["key"] != key:
             raise FileError(f"{path}: holds something else")
     except FileError as error:
         plugin.warn(f"{error}. The mask is made again")
@@ -81,13 +81,13 @@ def load(folder: Path, key: str) -> tuple[Tensor, dict[int, Tensor]] | None:
     return kept["weights"], kept["images"]
 
 
-def _is_mask(kept: Any) -> bool:
-    """Whether a file holds what `save` puts there."""
+def _is_mask(kept: Any, count: int) -> bool:
+    """Whether a file holds what `save` puts there, of `count` splats."""
     if not isinstance(kept, dict) or not {"key", "weights", "images"} <= set(kept):
         return False
     weights, images = kept["weights"], kept["images"]
     pictures = isinstance(images, dict) and all(_is_of(image, torch.uint8, 2) for image in images.values())
-    return pictures and _is_of(weights, torch.float32, 1)
+    return pictures and _is_of(weights, torch.float32, 1) and len(weights) == count and bool(weights.isfinite().all())
 
 
 def _is_of(value: Any, dtype: torch.dtype, ndim: int) -> bool:

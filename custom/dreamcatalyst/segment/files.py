@@ -74,7 +74,10 @@ def _lacking(folder: Path, lacking: list[str], taken: set[Path], wanted: int) ->
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     """A picture as float32 [height,width] in [0,1]. Raises DataError: not a picture, or of another shape."""
-    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error):  # such as an empty file
+        image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise DataError(f"{path}: is damaged, or no picture of 8 or 16 bits")
     h, w = image.shape[:2]

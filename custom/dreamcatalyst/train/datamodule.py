@@ -14,7 +14,7 @@ from .. import plugin
 from ..config import AtLeastOne, Seed, parse
 from ..data.inria import beside as cameras_beside
 from ..data.origin import ZERO, Origin
-from ..data.views import Capture, CaptureOptions, open_capture, views_for_step
+from ..data.views import DRAWN, Capture, CaptureOptions, open_capture, require_memory, views_for_step
 from ..demo.capture import PREFIX, world_capture
 from ..demo.worlds import World, make_world
 from ..errors import ConfigError
@@ -77,9 +77,25 @@ class SplatData(plugin.pl.LightningDataModule):
             self.capture = orbit_capture(scene, self.cfg)
         else:
             raise ConfigError("data.source: nothing is given. Name a capture folder or demo:statue.")
+        self._check_batch(self.capture)
         for notice in self.capture.notices:
             plugin.info(notice)
         return self.capture
+
+    def _check_batch(self, capture: Capture) -> None:
+        largest = max((view.camera for view in capture.views), key=lambda c: c.width * c.height)
+        require_memory(
+            self.cfg.batch_size * largest.width * largest.height * DRAWN,
+            f"data.batch_size={self.cfg.batch_size}: so many views of {largest.width}x{largest.height} pixels",
+            "Set a smaller one",
+        )
+        sizes = {(c.width, c.height) for c in (capture.views[i].camera for i in capture.train)}
+        if self.cfg.batch_size > 1 and len(sizes) > 1:
+            found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)[:5])
+            raise ConfigError(
+                f"data.batch_size: got {self.cfg.batch_size}, expected 1: the views are of different sizes ({found}), "
+                "which cannot be one batch. Or set data.width and data.height"
+            )
 
     def origin(self, splats: str = "") -> Origin:
         """The point of the files' world that is (0,0,0) in this run, the same for cameras and splats: of the capture,

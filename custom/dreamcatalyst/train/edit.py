@@ -27,7 +27,7 @@ from ..report.pictures import write_png
 from ..scene.edit import Splats
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
-from ..scene.ply import read_ply, write_ply
+from ..scene.ply import read_splats, write_ply
 from ..segment.api import MaskConfig
 from .confine import Start, confine
 from .densify import DensifyConfig
@@ -170,7 +170,7 @@ class EditSystem(SplatSystem):
             self.perceptual = Lpips(losses.perceptual_weights, self.root_device, "system.loss.perceptual_weights")
         if self.source is None:
             self.check_detail()
-            given = self.given_scene() if not self.cfg.original else read_ply(self.cfg.original, origin=self.origin)
+            given = self.given_scene() if not self.cfg.original else read_splats(self.cfg.original, origin=self.origin)
             self.source = given.to(self.root_device)
             # Splats of one's own are another scene, and a prior that is exact has a truth of its own.
             whole = not (self.cfg.gs_source or self.cfg.original or self.guidance.prior.exact)

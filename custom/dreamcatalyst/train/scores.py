@@ -53,7 +53,7 @@ def last_scores(system: SplatSystem, views: Sequence[int]) -> dict[int, dict[str
     """Scores that are taken once, at the end: consistency with the view that is nearest ("short") and 7th nearest
     ("long"), of the splats and of `known_scenes`, and CLIP's."""
     scores: dict[int, dict[str, float]] = {index: {} for index in views}
-    everything = system.capture.cameras()
+    everything = system.capture.poses(range(len(system.capture)))
     for name, scene in {"": system.splats.scene.detach(), **system.known_scenes()}.items():
         renders = {}
         for index in views:

@@ -28,7 +28,7 @@ from ..scene.edit import Splats
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
-from ..scene.ply import read_ply, write_ply
+from ..scene.ply import read_splats, write_ply
 from . import results, scores, summary
 from .base import System
 from .densify import STATISTICS, DensifyConfig, densify, observe, reset_opacity, screen_statistics
@@ -134,7 +134,7 @@ class SplatSystem(System):
     def given_scene(self) -> Gaussians:
         """The splats of gs_source, or of the made world. Raises ConfigError where there are neither."""
         if self.cfg.gs_source:
-            return read_ply(self.cfg.gs_source, drop_nonfinite=self.cfg.drop_nonfinite, origin=self.origin)
+            return read_splats(self.cfg.gs_source, drop_nonfinite=self.cfg.drop_nonfinite, origin=self.origin)
         if self.data.world is not None:
             return self.data.world.scene
         if self.data.cfg.source:  # where that is wrong, too, it is the first thing to say
