@@ -11,6 +11,7 @@ import inspect
 import logging
 import os
 import shlex
+import signal
 import sys
 import traceback
 import warnings
@@ -76,7 +77,7 @@ def main(argv: list[str] | None = None) -> int:
     from dreamcatalyst.errors import DreamCatalystError
     from dreamcatalyst.signals import Stop, Stopped, lasting_streams
 
-    with lasting_streams(), Stop().installed() as stop:
+    with Stop().installed() as stop, lasting_streams():
         try:
             return link_into(args.link) if args.link else run(args, overrides, stop)
         except Stopped as stopped:
@@ -111,7 +112,7 @@ def run(args: argparse.Namespace, overrides: list[str], stop: Any) -> int:
     if args.gpu is not None:
         os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(args.gpu))  # read by torch, which is not imported yet
     merged = merge_config(args.config, cli_args=overrides)
-    config = read_config(merged)
+    config = read_config(merged, lambda: keys_below(merged))
     mode = args.mode or "train"
 
     from dreamcatalyst.runs import claimed, told
@@ -196,6 +197,20 @@ def classes(config: Any) -> dict[str, type]:
             raise ConfigError(f"{key}_type: '{name}' is registered, but is no {base.__name__}.")
         check(found[key], getattr(config, key), key)
     return found
+
+
+def keys_below(merged: Any) -> list[str]:
+    """The dotted keys that the sections of a config take, whatever is wrong with it otherwise."""
+    from dreamcatalyst import plugin
+    from dreamcatalyst.config import known_keys
+    from lightning.pytorch import Trainer
+    from lightning.pytorch.callbacks import ModelCheckpoint
+
+    names = {section: merged.get(f"{section}_type") for section in ("data", "system")}
+    known = plugin.names()
+    found = [key for where, name in names.items() if name in known for key in known_keys(plugin.find(name), where)]
+    options = {"trainer": Trainer, "checkpoint": ModelCheckpoint}
+    return found + [f"{where}.{key}" for where, cls in options.items() for key in inspect.signature(cls).parameters]
 
 
 def build(config: Any, parts: dict[str, type]) -> tuple[Any, Any]:
@@ -320,5 +335,13 @@ def quiet() -> None:
     warnings.filterwarnings("ignore", module=r"lightning\.")
 
 
+def end_by_ctrl_c() -> None:
+    """Have Ctrl-C end this process without a traceback wherever `main` does not take it: while Python starts and ends.
+    Where whoever started us has us ignore it, it stays ignored."""
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 if __name__ == "__main__":
+    end_by_ctrl_c()
     sys.exit(main())

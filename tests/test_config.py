@@ -355,7 +355,6 @@ def test_other_arguments_are_read_as_yaml(written):
         ("name: x", ["nmae=y"], "config: unknown key 'nmae'. Did you mean 'name'?"),
         ("", [], "run.yaml: is empty, expected keys such as data_type"),
         ("# nothing yet", [], "run.yaml: is empty"),
-        ("hello", [], "run.yaml: unknown key 'hello'"),
         ("name: x", ["system..a=1"], "'system..a' is no key: a part of it is empty"),
         ("name: x", ["system.=1"], "'system.' is no key: a part of it is empty"),
         ("name: x", ["system.a=${system.b}"], "system.a: "),
@@ -367,6 +366,13 @@ def test_other_arguments_are_read_as_yaml(written):
         ("a: [1", [], ": not valid YAML: "),
         ("a: 1\na: 2", [], "run.yaml:2:1: not valid YAML: found duplicate key"),
         ("- a", [], "run.yaml: got a list"),
+        ("", [], "run.yaml: is empty, expected keys such as data_type"),
+        ("# nothing yet", [], "run.yaml: is empty"),
+        ("hello", [], "run.yaml: got a single value"),
+        ("5", [], "run.yaml: got a single value"),
+        ("name: x", ["system..a=1"], "'system..a' is no key: a part of it is empty"),
+        ("name: x", ["system.=1"], "'system.' is no key: a part of it is empty"),
+        ("tag: 'x${system.a}'", ["system.a=Costs ${5}"], "system.a: Interpolation key '5' not found, in Costs ${5}"),
         ("system: 5", [], "system: got 5 (int), expected dict"),
         ("trainer: {max_steps: abc, x: '${add:${trainer.max_steps},1}'}", [], "trainer.max_steps: got 'abc'"),
         ("trainer: {max_steps: true}", [], "trainer.max_steps: got True (bool), expected a whole number"),
@@ -382,6 +388,24 @@ def test_a_run_that_cannot_be_is_refused(written, text, arguments, said):
     with pytest.raises(ConfigError) as error:
         load_config(written(text), cli_args=arguments)
     assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("argument", "meant"),
+    [
+        ("renderer.backend=cpu", "'system.renderer.backend'?"),
+        ("renderer.backen=cpu", "'system.renderer'?"),
+        ("max_steps=5", "'trainer.max_steps'?"),
+        ("every=5", "'system.densify.every' or 'system.report.every'?"),
+        ("sed=5", "'seed'?"),
+    ],
+)
+def test_a_key_without_its_section_is_told_with_it(written, argument, meant):
+    below = ["renderer", "renderer.backend", "densify.every", "report.every"]
+    merged = merge_config(written("name: x"), cli_args=[argument])
+    with pytest.raises(ConfigError) as error:
+        read_config(merged, lambda: [*(f"system.{key}" for key in below), "trainer.max_steps"])
+    assert f"unknown key '{argument.partition('=')[0].partition('.')[0]}'. Did you mean {meant}" in str(error.value)
 
 
 @pytest.mark.parametrize("text", ["../..", "/", "/etc", "..", "a/b", "\\", "x\0y", "long " * 100, "ü" * 200, " . "])

@@ -155,10 +155,4 @@ CASES: list[Case] = [
     ),
     prior("its kind called sd", folder(lambda r: None, "system.guidance.prior_type=sd"), "unet", "ip2p"),
     case("prior", "a CLIP that is not there", ["system.report.clip=./clip"], "clip"),
-    case(
-        "prior",
-        "paired noise on a learned prior",
-        [*IP2P, "system.guidance.prior.path=demo:prior", "system.guidance.noise=paired"],
-        "noise",
-    ),
 ]

@@ -40,6 +40,7 @@ def child(words: Sequence[str], folder: str, out: str, environment: dict[str, st
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     import launch
 
+    launch.end_by_ctrl_c()
     sys.exit(launch.main(list(words)))
 
 

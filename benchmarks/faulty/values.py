@@ -113,8 +113,10 @@ CASES: list[Case] = [
     case(
         "value",
         "densify.stop before densify.start",
-        ["system.densify.every=1", "system.densify.start=100", "system.densify.stop=50"],
-        "system.densify",
+        ["system.densify.every=1", "system.densify.start=100", "system.densify.stop=1"],
+        "densify.stop ends it at 1",
+        status=0,
+        seconds=30,
     ),
     case(
         "value",

@@ -13,14 +13,14 @@ import sys
 import time
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Union
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from .errors import ConfigError, choose, nearest, unknown
 from .files import folder_name, write_text
@@ -130,6 +130,15 @@ def check(cls: type, node: Any, where: str) -> dict[str, Any]:
         section, place = getattr(config, name), f"{where}.{name}"
         parsed[name] = check(part, section, place) if hasattr(part, "Config") else parse(part, section, place)
     return parsed
+
+
+def known_keys(cls: type, where: str) -> Iterator[str]:
+    """The dotted keys below `where` that a registered class takes, or a dataclass, with those of its `parts`."""
+    parts = getattr(cls, "parts", {})
+    for spec in dataclasses.fields(getattr(cls, "Config", cls)):
+        yield f"{where}.{spec.name}"
+        if spec.name in parts:
+            yield from known_keys(parts[spec.name], f"{where}.{spec.name}")
 
 
 def _default(spec: dataclasses.Field) -> Any:
@@ -341,17 +350,28 @@ def merge_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: 
     return merged
 
 
-def read_config(merged: DictConfig) -> ExperimentConfig:
+def read_config(merged: DictConfig, below: Callable[[], Iterable[str]] = tuple) -> ExperimentConfig:
     """The run that `merge_config` describes: resolved, parsed, with the names of its folders. Raises ConfigError.
 
-    A run that resumes from `<trial>/ckpts/x.ckpt` gets that trial's folder.
+    A run that resumes from `<trial>/ckpts/x.ckpt` gets that trial's folder. below: the dotted keys that sections take,
+    asked for where a key is unknown: it may be one of them without its section.
     """
+    plain = OmegaConf.to_container(merged)
+    known = [f.name for f in dataclasses.fields(ExperimentConfig)]
+    for key in plain:
+        if key not in known:
+            raise ConfigError(unknown("key", key, known, "config", _misplaced(key, plain, list(below()))))
     _check_first(merged)
     try:
         resolved = OmegaConf.create(_escaped(OmegaConf.to_container(merged, resolve=True)))
     except OmegaConfBaseException as error:
-        reason = f"{str(error).splitlines()[0]}, in {error.child_node}"
-        raise ConfigError(f"{getattr(error, 'full_key', None) or 'config'}: {reason}") from error
+        place, text = getattr(error, "full_key", None) or "config", str(error.child_node)
+        reason = str(error).splitlines()[0]
+        # What follows from a text is not to blame for what the text refers to.
+        missing = re.search("Interpolation key '(.*)' not found", reason)
+        origin = [(k, t) for k, t in leaves(plain) if missing and f"${{{missing[1]}}}" in str(t)]
+        place, text = origin[0] if origin else (place, text)
+        raise ConfigError(f"{place}: {reason}, in {text}") from error
     return _with_folders(parse(ExperimentConfig, resolved))
 
 
@@ -387,12 +407,25 @@ def _check_first(merged: DictConfig) -> None:
         )
 
 
-def missing_keys(node: Any, where: str = "") -> Iterator[str]:
+def leaves(node: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """The dotted key and the value of all that is no dict in nested dicts."""
+    if not isinstance(node, dict):
+        yield where, node
+        return
+    for key, below in node.items():
+        yield from leaves(below, f"{where}.{key}" if where else str(key))
+
+
+def missing_keys(node: Any) -> list[str]:
     """The dotted keys of those values that a YAML leaves to its user (`???`); node: nested dicts, unresolved."""
-    if node == "???":
-        yield where
-    for key, below in node.items() if isinstance(node, dict) else ():
-        yield from missing_keys(below, f"{where}.{key}" if where else str(key))
+    return [key for key, value in leaves(node) if isinstance(value, str) and value == "???"]
+
+
+def _misplaced(key: str, plain: dict, below: Sequence[str]) -> list[str]:
+    """The dotted keys among `below` that end as the first value under the unknown `key` does, or as `key`."""
+    whole = next((name for name, _ in leaves(plain[key], key)), key)
+    found = ([name for name in below if name.endswith(f".{end}")] for end in (whole, key))
+    return next((names for names in found if names), [])
 
 
 def save_config(config: ExperimentConfig, path: Path, merged: DictConfig | None = None) -> None:
@@ -438,17 +471,20 @@ def _read(path: Path) -> DictConfig:
         known = f" Known: {', '.join(there)}." if there else ""
         raise ConfigError(f"--config: there is no file '{path}'.{nearest(str(path), there)}{known}")
     try:
-        loaded = OmegaConf.load(path)
+        content = yaml.compose(path.read_text(encoding="utf-8"))
+        loaded = OmegaConf.load(path) if isinstance(content, yaml.MappingNode) else None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
         raise ConfigError(f"{place}: not valid YAML: {error.problem}.") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid YAML: {error}.") from error
+    if loaded is None:
+        faults = {type(None): "is empty", yaml.SequenceNode: "got a list", yaml.ScalarNode: "got a single value"}
+        raise ConfigError(
+            f"{path}: {faults[type(content)]}, expected keys such as data_type, data, system_type, system."
+        )
     known = [f.name for f in dataclasses.fields(ExperimentConfig)]
-    if not isinstance(loaded, DictConfig) or not loaded:
-        fault = "is empty" if loaded is not None and not len(loaded) else "got a list"
-        raise ConfigError(f"{path}: {fault}, expected keys such as data_type, data, system_type, system.")
     for key in loaded:
         if key not in known:
             raise ConfigError(unknown("key", key, known, str(path)))
@@ -494,12 +530,16 @@ def _dotlist(arguments: Sequence[str]) -> DictConfig:
             parsed = text
         is_text = isinstance(parsed, str) and text[:1] not in ("'", '"')
         is_word = isinstance(parsed, bool) and text.lower() not in ("true", "false")
+        if not all(key.split(".")):
+            raise ConfigError(f"'{argument}' on the command line: '{key}' is no key: a part of it is empty.")
         is_prose = OmegaConf.is_config(parsed) and text[:1] not in ("[", "{")
         value = text if is_text or is_word or is_prose else parsed
         if isinstance(value, str) and (key.endswith("prompt") or _is_words(value)):
             value = _escaped(value)
         try:
             OmegaConf.update(config, key, value, force_add=True)
+        except GrammarParseError as error:
+            raise ConfigError(f"{key}: '{text}' is no reference to another key, ${{key}}.") from error
         except OmegaConfBaseException as error:
             raise ConfigError(f"'{argument}' on the command line: '{key}' is no key: {error}") from error
     return config

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class DreamCatalystError(Exception):
@@ -44,11 +44,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" Did you mean '{close[0]}'?" if close else ""
 
 
-def unknown(kind: str, name: object, known: Iterable[str], where: str = "") -> str:
-    """The message for a name that is not among `known`: place, name, nearest, all known ones."""
+def unknown(kind: str, name: object, known: Iterable[str], where: str = "", elsewhere: Sequence[str] = ()) -> str:
+    """The message for a name that is not among `known`: place, name, nearest, all known ones. elsewhere: where else the
+    name is known, in full; it is then meant rather than one that looks alike."""
     known = sorted(known)
     place = f"{where}: " if where else ""
-    return f"{place}unknown {kind} '{name}'.{nearest(str(name), known)} Known: {', '.join(known) or 'none'}."
+    meant = f" Did you mean {' or '.join(map(repr, elsewhere))}?" if elsewhere else nearest(str(name), known)
+    return f"{place}unknown {kind} '{name}'.{meant} Known: {', '.join(known) or 'none'}."
 
 
 def choose(kind: str, name: str, known: Iterable[str], where: str = "") -> str:

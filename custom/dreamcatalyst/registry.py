@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from .errors import choose
@@ -37,6 +37,9 @@ class Registry:
             target = getattr(importlib.import_module(module, self.package), attribute)
             self._targets[name] = target
         return target
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names())
 
     def names(self) -> list[str]:
         """All registered names, sorted."""

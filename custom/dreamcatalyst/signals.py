@@ -19,7 +19,10 @@ class Stopped(BaseException):
 
 class Stop:
     """What a signal has asked for. Where `waits` is true, the first one is only noted, in `asked`, for the one who set
-    it to stop at the next good place; else, and at the second one, it raises Stopped at once.
+    it to `end()` at the next good place; else, and at the second one, it raises Stopped at once.
+
+    Stopped is raised once. A signal that comes while it makes its way up would raise another out of the middle of what
+    takes care of the first: it is only counted, and one more of them ends the process on the spot.
 
     asked: number of the signal, None while there was none. at_once: whether Stopped was raised in the middle of
     something that `waits` was to protect.
@@ -28,8 +31,15 @@ class Stop:
     def __init__(self) -> None:
         self.asked: int | None = None
         self.waits = self.at_once = False
+        self._ending = self._late = False
 
     def __call__(self, signum: int, frame: Any = None) -> None:
+        if self._ending:
+            if self._late:
+                signal.signal(signum, signal.SIG_DFL)
+                os.kill(os.getpid(), signum)
+            self._late = True
+            return
         first, self.asked = self.asked is None, signum
         if first and self.waits:
             # Not by way of a logger or a stream, in whose own code the signal may have come.
@@ -37,6 +47,11 @@ class Stop:
                 os.write(2, f"\r{self.name}: stopping after this step (once more: at once)\n".encode())
             return
         self.at_once = self.waits
+        self.end()
+
+    def end(self) -> None:
+        """Stop here, as a signal has asked."""
+        self._ending = True
         raise Stopped(self.name)
 
     @property

@@ -62,6 +62,15 @@ def test_no_source_and_no_splats():
         SplatData({"batch_size": 0})
 
 
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [({"format": "blender"}, "data.format.*nerfstudio"), ({"orbit_up": "up"}, "data.orbit_up.*Known: -x, -y")],
+)
+def test_names_are_checked_for_a_world_too(given, error):
+    with pytest.raises(ConfigError, match=error):
+        SplatData({"source": "demo:statue", **given})
+
+
 @pytest.mark.parametrize("batch", [1, 3])
 def test_a_resumed_run_goes_on_with_the_same_views(tmp_path, batch):
     data = SplatData({"source": str(photographs(tmp_path, [(8, 6)] * 11)), "batch_size": batch, "seed": 5})

@@ -6,7 +6,7 @@ import filecmp
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -28,6 +28,7 @@ FORMATS = Registry("dataset format", __package__)
 FORMATS.add("colmap", ".colmap:FORMAT")
 FORMATS.add("inria", ".inria:FORMAT")
 FORMATS.add("nerfstudio", ".transforms:FORMAT")
+AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")}  # what data.orbit_up may name
 
 
 AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")}  # what data.orbit_up may name
@@ -37,7 +38,7 @@ AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")
 class CaptureOptions:
     """How a capture is read; the defaults are those of 3DGS."""
 
-    format: str | None = None  # one of FORMATS; None: whichever finds its files
+    format: str | None = field(default=None, metadata={"choices": FORMATS})  # None: whichever finds its files
     images: str = "images"  # folder of the photographs in a COLMAP capture
     downscale: Annotated[float, Range("[1, inf)")] = 1.0  # photographs are made smaller by this factor, at least 1
     width: Side | None = None  # pixels; with height: centred crop to their aspect, then resize
@@ -49,7 +50,7 @@ class CaptureOptions:
     background: Colour = (0.0, 0.0, 0.0)  # RGB in [0,1] behind transparent photographs
     dataparser: str = ""  # nerfstudio's dataparser_transforms.json of the splats: cameras are moved into their world
     orbit_views: Annotated[int, Range("[1, 10000]")] = 48  # views of an orbit around splats that come without cameras
-    orbit_up: str = "-y"  # x, y, z, -x, -y or -z: which way is up in them; -y suits COLMAP's worlds, z nerfstudio's
+    orbit_up: str = field(default="-y", metadata={"choices": AXES})  # up in them: -y suits COLMAP's, z nerfstudio's
 
     def __post_init__(self) -> None:
         if self.format is not None:

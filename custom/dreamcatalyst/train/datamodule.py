@@ -62,7 +62,8 @@ class SplatData(plugin.pl.LightningDataModule):
 
     def open(self, scene: Gaussians | None = None, splats: str = "") -> Capture:
         """The capture, read at the first call. Where there is no source: the cameras that 3DGS wrote beside the file
-        `splats` (a PLY), or else an orbit around `scene`."""
+        `splats` (a PLY), or else an orbit around `scene`. Raises ConfigError where a step would take more
+        views than there are."""
         if self.capture is not None:
             return self.capture
         if self.world is not None:

@@ -60,7 +60,7 @@ class Keeper(plugin.pl.Callback):
 
     def _stop_if_asked(self, *hook_arguments: Any) -> None:
         if self.stop.asked is not None:
-            raise Stopped(self.stop.name)
+            self.stop.end()
 
     on_train_batch_start = on_validation_batch_start = _stop_if_asked
 

@@ -108,7 +108,9 @@ class Draft:
         if not densify.every:
             self.leave_out("densification", "densify.every is 0")
         elif (times := density_steps(densify, system.max_steps)) == 0:
-            self.leave_out("densification", "it would start after the end of the run, or after densify.stop")
+            ends = "densify.stop" if densify.stop < system.max_steps else "the run"
+            why = f"densify.start is {densify.start}, and {ends} ends it at {min(densify.stop, system.max_steps)}"
+            self.leave_out("densification", why)
         elif len(system.splats) >= densify.max_splats:
             full = f"{len(system.splats):,} editable splats, max_splats {densify.max_splats:,}: raise it to add any"
             self.add("densification", f"{times} times, removing only: densify has no room ({full})")
