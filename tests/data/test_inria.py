@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 import torch
@@ -50,6 +51,16 @@ def test_the_file_is_found_from_the_splats_that_belong_to_it(tmp_path):
         ([{k: v for k, v in ENTRY.items() if k != "rotation"}], "camera 0 has no 'rotation'"),
         ([{**ENTRY, "rotation": [[1, 0], [0, 1]]}], "camera 0 has a pose that is not of 3x3 and 3 numbers"),
         ([], "empty reconstruction"),
+        ([5], "camera 0 is 5, expected an object with width, height"),
+        ([ENTRY, None], "camera 1 is None"),
+        ([{**ENTRY, "width": math.inf}], "camera 0: 'width' is inf, expected a number"),
+        ([{**ENTRY, "height": None}], "camera 0: 'height' is None"),
+        ([{**ENTRY, "fx": math.nan}], "camera 0: 'fx' is nan"),
+        ([{**ENTRY, "fx": -5}], "camera of 'b': focal length fx is -5.0, expected a number in"),
+        ([{**ENTRY, "height": 0}], "camera of 'b': height is 0"),
+        ([{**ENTRY, "position": [math.nan, 0, 0]}], "pose of 'b' is not of finite numbers"),
+        ([{**ENTRY, "width": 10**9}], "camera of 'b': width is 1000000000"),
+        ([{**ENTRY, "width": 60000, "height": 60000}], "views of 60000x60000 pixels, expected 32766 a side at most"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, content, message):

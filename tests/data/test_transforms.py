@@ -108,6 +108,27 @@ def test_points_beside_the_file(tmp_path):
         open_capture(tmp_path, ALL)
 
 
+NO_NUMBERS = [
+    *(("fl_x", value) for value in (0, -30, math.nan, math.inf, True)),
+    *(("fl_y", 0), ("cx", math.nan), ("cy", -math.inf), ("k1", math.nan), ("p2", math.inf)),
+    *((key, value) for key in ("w", "h") for value in (0, -24, math.inf, math.nan)),
+]
+FAR = [[1, 0, 0, 1e30], [0, 1, 0, 0], [0, 0, 1, 0]]
+
+
+def test_a_file_that_begins_with_a_mark_of_its_encoding_is_read(tmp_path):
+    path = write(tmp_path) / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(open_capture(tmp_path, ALL)) == 1
+
+
+def test_one_place_photographed_twice_is_two_views(tmp_path):
+    """A tripod: the same pose, other pictures."""
+    write(tmp_path, [frame(), frame("b.png")])
+    cv2.imwrite(str(tmp_path / "b.png"), np.full((48, 64, 3), 91, np.uint8))
+    assert len(open_capture(tmp_path, ALL)) == 2
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
@@ -127,6 +148,29 @@ def test_points_beside_the_file(tmp_path):
         ),
         (dict(frames=[frame(transform_matrix=np.diag([1.0, 2, 1, 1]).tolist())]), "'images/a.png' is not a rotation"),
         (dict(w=48, h=64), "not the shape of its camera, 48x64. It lies on its side"),
+        *((dict([wrong]), f"frame 0: '{wrong[0]}' is .*, expected ") for wrong in NO_NUMBERS),
+        *(
+            (dict(drop=["fl_x", "fl_y"], camera_angle_x=angle), "'camera_angle_x' is")
+            for angle in (0, -1, 40, math.nan)
+        ),
+        (dict(fl_x=10**400), "'fl_x' is '10*', expected a number"),
+        (dict(frames=[frame(5)]), "frame 0: 'file_path' is 5, expected the path of a photograph"),
+        (dict(frames=[frame("a\0.png")]), "frame 0: 'file_path' is"),
+        (dict(frames=[frame(None)]), "frame 0: 'file_path' is None"),
+        (dict(camera_model=["PINHOLE"]), "unknown camera_model"),
+        (dict(ply_file_path=5), "'ply_file_path' is 5"),
+        (dict(frames=[frame(transform_matrix=np.zeros((4, 4)).tolist())]), "frame 0, transform_matrix: is no rotation"),
+        (
+            dict(frames=[frame(transform_matrix=np.full((4, 4), np.nan).tolist())]),
+            "frame 0, transform_matrix: expected",
+        ),
+        (dict(frames=[frame(transform_matrix=FAR)]), "pose of 'images/a.png' is not of finite numbers"),
+        (dict(frames=[frame(), frame()]), "photograph 'images/a.png' is there twice"),
+        (dict(frames=[frame(), frame("./images/../images/a.png")]), "'images/a.png' is there twice"),
+        (
+            dict(frames=[frame(), frame("b.png")], photos=("images/a.png", "b.png")),
+            "'b.png' and 'images/a.png' is there",
+        ),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, change, message):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import struct
 import threading
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from dreamcatalyst.config import parse
-from dreamcatalyst.data.images import ImageCache, Photo
+from dreamcatalyst.data.images import ImageCache, Photo, image_size
 from dreamcatalyst.data.lens import Lens
 from dreamcatalyst.data.views import Capture, CaptureOptions, fit, open_capture, split, views_for_step
 from dreamcatalyst.errors import DataError, DreamCatalystError
@@ -102,6 +104,51 @@ def test_a_crop_lies_inside_and_has_the_targets_aspect(width, height, out_width,
 def test_options_that_cannot_be(options, message):
     with pytest.raises(DreamCatalystError, match=message):
         parse(CaptureOptions, options, "data")
+
+
+def test_names_are_checked_whatever_the_source_is():
+    with pytest.raises(DreamCatalystError, match="data.format: unknown format 'blender'.*nerfstudio"):
+        parse(CaptureOptions, {"format": "blender"}, "data")
+
+
+def test_photographs_of_more_pixels_than_pillow_takes_are_opened(tmp_path, monkeypatch):
+    """Pillow refuses twice MAX_IMAGE_PIXELS; panoramas have more. What bounds them is memory."""
+    from PIL import Image
+
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    assert len(capture(tmp_path)) == 3 and Image.MAX_IMAGE_PIXELS == 1000
+    monkeypatch.setattr("dreamcatalyst.data.views.free_memory", lambda: 12 * WIDTH * HEIGHT - 1)
+    with pytest.raises(DataError, match="000.png: 64x48 pixels need .* GiB are free. Make smaller copies"):
+        open_capture(tmp_path, CaptureOptions(max_side=2))
+
+
+def test_views_that_memory_cannot_hold_are_refused(monkeypatch):
+    monkeypatch.setattr("dreamcatalyst.data.views.free_memory", lambda: 2**30)
+    with pytest.raises(DataError, match="views of 20000x10000 pixels need 18.6 GiB, and 1.0 GiB are free. Set data"):
+        fit(20000, 10000, CaptureOptions())
+    assert fit(20000, 10000, CaptureOptions(max_side=1000))[1:] == (1000, 500)
+
+
+@pytest.mark.parametrize("keep", [0, 4, 30, 0.5])
+def test_a_photograph_that_is_not_whole_is_refused_when_the_capture_is_opened(tmp_path, keep):
+    capture(tmp_path, image=np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
+    whole = (tmp_path / "001.png").read_bytes()
+    (tmp_path / "001.png").write_bytes(whole[: int(keep * len(whole)) if isinstance(keep, float) else keep])
+    with pytest.raises(DataError, match="001.png: is (cut off|not an image)"):
+        open_capture(tmp_path, ALL)
+
+
+def test_a_picture_that_promises_more_than_its_bytes_can_hold_is_refused(tmp_path):
+    """PNG's compression makes at most 1032 bytes of one."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", 16000, 12000, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(bytes(10))) + chunk(b"IEND", b"")
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    with pytest.raises(DataError, match="a.png: is cut off or damaged: so few bytes do not hold 16000x12000 pixels"):
+        image_size(tmp_path / "a.png")
 
 
 def test_nothing_to_read(tmp_path):

@@ -1,5 +1,6 @@
 """The second start takes no compile time: what numba compiles stays on disk, and another process finds all of it."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -27,9 +28,48 @@ kept = [kernel.stats for kernel in kernels if kernel.stats.cache_path]
 print(sum(sum(s.cache_hits.values()) for s in kept), sum(sum(s.cache_misses.values()) for s in kept))
 """
 
+SMALL = """
+import sys
+sys.path.insert(0, "custom")
+import logging
+logging.basicConfig()
+from dreamcatalyst.render.cpu_jit import kernel
+
+@kernel()
+def one(x):
+    return x + 1
+
+@kernel()
+def two(x):
+    return one(x) + 1
+
+print(two(1), "done")
+"""
+
 
 def test_a_second_process_compiles_nothing():
     for _ in range(2):
         done = subprocess.run([sys.executable, "-c", DRAW], cwd=ROOT, capture_output=True, text=True, check=True)
     hits, misses = map(int, done.stdout.split())
     assert hits >= 6 and misses == 0
+
+
+def test_kernels_that_were_cut_off_are_compiled_anew_and_said(tmp_path):
+    """The index of one kernel and the code of another; numba itself would end every later run."""
+    script, environment = tmp_path / "script.py", {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    script.write_text(SMALL)
+
+    def draw() -> subprocess.CompletedProcess:
+        return subprocess.run(
+            [sys.executable, str(script)], cwd=ROOT, capture_output=True, text=True, check=True, env=environment
+        )
+
+    assert "damaged" not in draw().stderr
+    kinds = [sorted(tmp_path.rglob(pattern)) for pattern in ("*.nbi", "*.nbc")]
+    assert kinds[0] and kinds[1]
+    for number, files in enumerate(kinds):
+        for path in files[number::2]:
+            os.truncate(path, path.stat().st_size // 2)
+    mended = draw()
+    assert "a compiled kernel is damaged" in mended.stderr and mended.stdout.startswith("3 ")
+    assert "damaged" not in draw().stderr

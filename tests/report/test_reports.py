@@ -55,6 +55,13 @@ def test_video_is_h264_that_browsers_play(tmp_path):
         assert sum(1 for _ in reader) == 5
 
 
+@pytest.mark.parametrize("height, width", [(1, 1), (19, 1), (1, 6)])
+def test_a_video_of_one_pixel_a_side_is_written(tmp_path, height, width):
+    path = write_video(tmp_path / "video.mp4", [np.full((height, width, 3), 200, np.uint8)] * 3)
+    with imageio.get_reader(path) as reader:
+        assert abs(int(reader.get_data(0).mean()) - 200) < 8
+
+
 def test_curve(tmp_path):
     curve = Curve()
     curve.add(step=0, seconds=0.0, psnr=1.0)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from dreamcatalyst.errors import FileError, SceneError
 from dreamcatalyst.scene.gaussians import SH_C0, Gaussians
-from dreamcatalyst.scene.ply import read_ply, write_ply
+from dreamcatalyst.scene.ply import read_ply, read_splats, write_ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -240,6 +240,32 @@ def test_truncated_files_and_zero_splats(tmp_path, order):
     path.write_bytes(header)
     with pytest.raises(SceneError, match="end_header"):
         read_ply(path)
+
+
+@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
+def test_more_rows_than_the_file_has_bytes_take_no_memory(tmp_path, order):
+    """Four thousand million splats would be 268 GiB."""
+    path = dump(tmp_path / "a.ply", table(names(0)), order, count=4_000_000_000)
+    with pytest.raises(SceneError, match="truncated: the header promises 4000000000 splats"):
+        read_ply(path)
+
+
+def test_splats_that_nobody_can_draw_are_refused_or_left_out(tmp_path, capsys):
+    """Scales that are no logarithms, and places whose squares float32 does not hold; far worlds are no such place."""
+    rows = table(names(0), n=4)
+    for name in ("x", "y", "z", "scale_0", "scale_1", "scale_2"):
+        rows[name] = -2.0
+    rows["x"] += 3e6
+    assert len(read_splats(dump(tmp_path / "a.ply", rows))) == 4
+    rows["scale_1"][2], rows["x"][1] = 100.0, 1e30
+    path = dump(tmp_path / "b.ply", rows)
+    with pytest.raises(SceneError, match=r"1 of 4 splats have positions beyond 1e\+15 .first: row 1"):
+        read_splats(path)
+    assert len(read_splats(path, drop_nonfinite=True)) == 2
+    assert "scale_* are logarithms" in capsys.readouterr().out
+    rows["x"] = 1e30
+    with pytest.raises(SceneError, match="4 of 4 splats have positions"):  # also where that is the world's middle
+        read_splats(dump(tmp_path / "c.ply", rows), origin=(1e30, 0.0, 0.0))
 
 
 def test_files_that_are_no_ply(tmp_path):

@@ -13,7 +13,7 @@ HEAD = "ply\nformat binary_little_endian 1.0\n"
 @pytest.mark.parametrize(
     "header, line",
     [
-        ("element vertex 2\nproperty float x\nproperty float x\n", "property float x"),
+        ("element vertex 2\nproperty float x\nproperty float x\n", "property float x': property 'x' is there twice"),
         ("element vertex -2\nproperty float x\n", "element vertex -2"),
         ("element vertex many\nproperty float x\n", "element vertex many"),
         ("property float x\nelement vertex 2\n", "property float x"),
@@ -24,7 +24,7 @@ HEAD = "ply\nformat binary_little_endian 1.0\n"
 def test_the_line_that_cannot_be_read_is_named(tmp_path, header, line):
     path = tmp_path / "splats.ply"
     path.write_bytes(f"{HEAD}{header}end_header\n".encode() + bytes(64))
-    with pytest.raises(SceneError, match=f"splats.ply: cannot read the header line '{line}'"):
+    with pytest.raises(SceneError, match=f"splats.ply: cannot read the header line '{line}"):
         read_vertices(path)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst import files
 from dreamcatalyst.config import parse
 from dreamcatalyst.errors import ConfigError, DataError, SceneError
 from dreamcatalyst.segment.api import MaskConfig, make_mask
@@ -49,9 +51,10 @@ def test_other_sizes_are_resized_and_other_shapes_refused(tmp_path):
     assert read_mask(path, 60, 40).shape == (40, 60)
     with pytest.raises(DataError, match="mask.png: is 30x20, which is not the shape of its view, 6x6"):
         read_mask(path, 6, 6)
-    (tmp_path / "broken.png").write_bytes(b"no picture")
-    with pytest.raises(DataError, match="broken.png: is damaged"):
-        read_mask(tmp_path / "broken.png", 6, 4)
+    for content in (b"no picture", b""):
+        (tmp_path / "broken.png").write_bytes(content)
+        with pytest.raises(DataError, match="broken.png: is damaged"):
+            read_mask(tmp_path / "broken.png", 6, 4)
 
 
 def test_views_without_a_file_are_listed_with_the_nearest_name(disc_world, tmp_path):
@@ -182,7 +185,7 @@ def test_masks_are_kept_under_all_that_made_them(disc_world, tmp_path, monkeypat
         assert make(**change)[1] == 1, change
 
 
-@pytest.mark.parametrize("damage", ["cut short", "one bit", "foreign", "no mask", "odd types"])
+@pytest.mark.parametrize("damage", ["cut short", "one bit", "foreign", "no mask", "odd types", "few", "nan"])
 def test_a_damaged_or_foreign_file_is_made_again(damage, disc_world, tmp_path, caplog):
     config = MaskConfig(kind="box", options={"center": [0.0, 0.0, 1.0], "radius": 0.7}, cache=str(tmp_path))
     first = make_mask(config, disc_world.request)
@@ -196,6 +199,10 @@ def test_a_damaged_or_foreign_file_is_made_again(damage, disc_world, tmp_path, c
         file.write_bytes(flipped)
     elif damage == "odd types":
         torch.save({**torch.load(file, weights_only=True), "weights": torch.zeros(3, 3)}, file)
+    elif damage in ("few", "nan"):
+        kept, _ = files.load(file)
+        few, nan = kept["weights"][:-1], torch.full_like(kept["weights"], math.nan)
+        files.save(file, {**kept, "weights": few if damage == "few" else nan})
     elif damage == "foreign":
         kept = torch.load(file, weights_only=True)
         torch.save({**kept, "key": "another"}, file)

@@ -48,6 +48,16 @@ def test_without_a_source_cameras_lie_beside_the_splats_or_go_round_them(tmp_pat
     assert str(SplatData({"source": "demo:statue"}).open(SPLAT, str(ply)).source) == "demo:statue"
 
 
+def test_a_batch_must_fit_into_memory_and_have_one_size(tmp_path):
+    mixed = photographs(tmp_path, [(8, 6), (16, 10), (8, 6), (10, 10)])
+    with pytest.raises(ConfigError, match="data.batch_size: got 2, expected 1: the views are of different sizes"):
+        SplatData({"source": str(mixed), "test_every": 0, "batch_size": 2}).open()
+    assert len(SplatData({"source": str(mixed), "test_every": 0}).open()) == 4
+    many = {"source": str(mixed), "width": 8, "height": 6, "batch_size": 10**12}
+    with pytest.raises(DataError, match="data.batch_size=1000000000000: so many views of 8x6 pixels need"):
+        SplatData(many).open()
+
+
 def test_a_capture_is_opened_once(tmp_path):
     data = SplatData({"source": str(photographs(tmp_path, [(8, 6)] * 3))})
     assert data.open() is data.open(SPLAT)

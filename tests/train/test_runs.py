@@ -3,6 +3,8 @@
 import csv
 import json
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from dreamcatalyst.demo.worlds import make_world
@@ -44,6 +46,21 @@ def test_a_fit_approaches_its_photographs_and_leaves_everything(launch):
         assert (trial / name).stat().st_size > 0, name
     summary = json.loads((trial / "report" / "summary.json").read_text())
     assert summary["step"] == 60 and summary["splats"] == len(read_ply(trial / "save" / "last.ply"))
+
+
+def test_photographs_of_several_sizes_are_fitted_and_scored(launch, tmp_path):
+    """Also how consistent neighbouring views are, which have no common size; and there is a report at the end."""
+    frames = []
+    for i, (width, height) in enumerate([(24, 18), (18, 24), (24, 18), (20, 20)]):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((height, width, 3), 40 * i, np.uint8))
+        pose = [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+        frames.append(dict(file_path=f"{i}.png", transform_matrix=pose, fl_x=20.0))
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    ply = write_ply(tmp_path / "a.ply", make_world("statue").scene[::50])
+    options = [f"data.source={tmp_path}", f"system.gs_source={ply}", "data.width=null", "data.height=null"]
+    trial = launch("fit.yaml", *options, "data.test_every=2", "trainer.max_steps=2", "system.report.video_frames=2")
+    assert (trial / "report" / "index.html").is_file() and (trial / "save" / "it2-test.mp4").is_file()
+    assert "consistency_short" in json.loads((trial / "report" / "summary.json").read_text())["mean"]
 
 
 def test_an_edit_approaches_the_edit_that_the_prior_knows(launch):
@@ -141,8 +158,8 @@ def test_preview_draws_a_grid_without_a_run(launch):
         ("system.renderer.backend=gpu", "rasterizer"),
         ("data.source=demo:statues", "Did you mean 'statue'"),
         ("system.guidance.guidance_scale=strong", "strong"),
-        ("system.report.video_frames=-1", "system.report: video_frames: got -1"),
-        ("system.renderer.background=[2,0,0]", "system.renderer: background: got"),
+        ("system.report.video_frames=-1", "system.report.video_frames: got -1"),
+        ("system.renderer.background=[2,0,0]", "system.renderer.background[0]: got 2.0"),
     ],
 )
 def test_wrong_input_is_one_clear_error(launch, capsys, override, words):

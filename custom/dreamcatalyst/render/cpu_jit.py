@@ -5,13 +5,31 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba
+from numba.core.caching import FunctionCache
+
+from .. import plugin
 
 _FOLDER = Path(__file__).parent
 _SOURCES = [*sorted(_FOLDER.glob("cpu_*.py")), _FOLDER / "thresholds.py", _FOLDER / "sh.py"]
 _DIGEST = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES)).hexdigest()[:16]
 _CACHE = Path(numba.config.CACHE_DIR or _FOLDER / "__pycache__") / f"kernels-{_DIGEST}"
+
+
+class Cache(FunctionCache):
+    """numba's cache of one function, which a damaged file does not stop."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled function for a signature; None, and so compiled anew, where there is none that can be read."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # unpickling what was cut off raises any kind
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
+            plugin.warn(f"{self._cache_path}: a compiled kernel is damaged ({reason}) and is compiled anew")
+            self.flush()
+            return None
 
 
 def kernel(**options) -> Callable:
@@ -25,7 +43,9 @@ def kernel(**options) -> Callable:
     def decorate(function: Callable) -> Callable:
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_CACHE)
         try:
-            return numba.njit(cache=True, error_model="numpy", **options)(function)
+            made = numba.njit(error_model="numpy", **options)(function)
+            made._cache = Cache(function)  # what `cache=True` does, with a cache of ours
+            return made
         finally:
             numba.config.CACHE_DIR = before
 
