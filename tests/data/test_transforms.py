@@ -158,6 +158,9 @@ def test_one_place_photographed_twice_is_two_views(tmp_path):
         (dict(frames=[frame("a\0.png")]), "frame 0: 'file_path' is"),
         (dict(frames=[frame(None)]), "frame 0: 'file_path' is None"),
         (dict(camera_model=["PINHOLE"]), "unknown camera_model"),
+        (dict(is_fisheye="no"), "frame 0: 'is_fisheye' is 'no', expected true or false"),
+        (dict(frames=[frame("a" * 5000)]), "1 of 1 photographs are missing"),
+        (dict(k1=1e8), "'images/a.png': camera: the distortion"),
         (dict(ply_file_path=5), "'ply_file_path' is 5"),
         (dict(frames=[frame(transform_matrix=np.zeros((4, 4)).tolist())]), "frame 0, transform_matrix: is no rotation"),
         (

@@ -53,6 +53,14 @@ class Photo:
         return np.ascontiguousarray(image)
 
 
+def there(path: Path) -> bool:
+    """Whether there is such a file or folder; under a name that none can have, such as a very long one, there is not."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file as stored (EXIF orientation is not applied), from its header alone."""
     from PIL import Image, UnidentifiedImageError

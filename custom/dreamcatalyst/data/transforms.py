@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..config import Range
 from ..errors import DataError, unknown
-from .images import SUFFIXES, image_size
+from .images import SUFFIXES, image_size, there
 from .lens import FINITE, FOCAL, SIDE, Lens
 from .views import CaptureOptions, Format, Points, Scan, Shot, read_json
 
@@ -70,6 +70,9 @@ def splats_from_capture(dataparser: str | Path, source: Path) -> Tensor:
     out = _matrix(saved["transform"], f"{path}: transform") @ np.linalg.inv(applied)
     applied_scale = _number(meta.get("applied_scale", 1.0), "applied_scale", str(source), POSITIVE)
     out[:3] *= _number(saved["scale"], "scale", str(path), POSITIVE) / applied_scale
+    scaled = out[:3, :3] @ out[:3, :3].T / np.cbrt(np.linalg.det(out[:3, :3])) ** 2
+    if not np.linalg.det(out[:3, :3]) > 0 or not np.allclose(scaled, np.eye(3), atol=1e-2):
+        raise DataError(f"{path}: transform: is not a rotation and a translation")
     return torch.from_numpy(out)
 
 
@@ -90,17 +93,21 @@ def _shot(path: Path, meta: dict, index: int, frame: dict) -> Shot:
 
 def _photo(path: Path) -> Path:
     """The file that `path` means: itself, or where it is missing and has no suffix, the same with one."""
-    if path.is_file() or path.suffix.lower() in SUFFIXES:
+    if there(path) or path.suffix.lower() in SUFFIXES:
         return path
     named = (path.with_name(path.name + suffix) for low in SUFFIXES for suffix in (low, low.upper()))
-    return next((candidate for candidate in named if candidate.is_file()), path)
+    return next((candidate for candidate in named if there(candidate)), path)
 
 
 def _lens(meta: dict[str, Any], where: str, photo: Path) -> Lens:
+    if not isinstance(meta.get("is_fisheye", False), bool):
+        raise DataError(f"{where}: 'is_fisheye' is {meta['is_fisheye']!r}, expected true or false")
     model = meta.get("camera_model", "OPENCV_FISHEYE" if meta.get("is_fisheye") else "OPENCV")
     if not isinstance(model, str) or model not in MODELS:
         raise DataError(unknown("camera_model", model, MODELS, where))
-    size = image_size(photo) if photo.is_file() else (1, 1)  # a missing photograph gets its own error later
+    size = (
+        image_size(photo) if there(photo) and photo.is_file() else (1, 1)
+    )  # a missing photograph gets its own error later
     meta = {key: _number(value, key, where, NUMBERS[key]) for key, value in meta.items() if key in NUMBERS}
     width, height = int(meta.get("w", size[0])), int(meta.get("h", size[1]))
     fx, fy = _focal(meta, "x", width), _focal(meta, "y", height)
@@ -162,7 +169,7 @@ def _points(path: Path, meta: dict) -> Points | None:
     if not isinstance(meta["ply_file_path"], str):
         raise DataError(f"{path}: 'ply_file_path' is {meta['ply_file_path']!r}, expected the path of a point cloud")
     cloud_path = path.parent / meta["ply_file_path"]
-    if not cloud_path.is_file():
+    if not there(cloud_path):
         raise DataError(f"{path}: its ply_file_path {cloud_path} is missing; remove the key to do without points")
     try:
         cloud = trimesh.load(cloud_path)

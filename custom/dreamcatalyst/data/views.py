@@ -20,7 +20,7 @@ from ..errors import DataError, choose
 from ..memory import free_memory
 from ..registry import Registry
 from .camera import Cameras
-from .images import ImageCache, Photo, image_size
+from .images import ImageCache, Photo, image_size, there
 from .lens import Lens
 from .origin import ZERO, Origin, far_origin
 
@@ -216,7 +216,7 @@ def open_capture(source: str | Path, options: CaptureOptions = CaptureOptions())
     cannot be read.
     """
     source = Path(source)
-    if not source.exists():
+    if not there(source):
         raise DataError(f"data.source: {source}: no such file or folder")
     names = FORMATS.names() if options.format is None else [options.format]
     formats = [FORMATS.get(name, "data.format") for name in names]
@@ -279,7 +279,7 @@ def read_json(path: Path) -> Any:
 
 
 def _check(source: Path, shots: list[Shot]) -> None:
-    missing = [shot for shot in shots if shot.path is not None and not shot.path.is_file()]
+    missing = [shot for shot in shots if shot.path is not None and not (there(shot.path) and shot.path.is_file())]
     if missing:
         count = f"{len(missing)} of {len(shots)} photographs are missing"
         raise DataError(f"{source}: {count}, first '{missing[0].path}'. Put them there, or set data.images")
@@ -332,7 +332,10 @@ def _view(shot: Shot, options: CaptureOptions) -> View:
         each, size = UNDISTORTED if lens.distorted else DECODED, f"{lens.width}x{lens.height}"
         require_memory(lens.width * lens.height * each, f"{shot.path}: {size} pixels", "Make smaller copies")
     window, width, height = fit(lens.width, lens.height, options)
-    K, viewmat = torch.from_numpy(lens.pinhole().K), torch.from_numpy(shot.viewmat)
+    try:
+        K, viewmat = torch.from_numpy(lens.pinhole().K), torch.from_numpy(shot.viewmat)
+    except DataError as error:
+        raise DataError(f"'{shot.name}': {error}") from error
     camera = Cameras(viewmat[None], K[None], lens.width, lens.height).cropped(*window).resized(width, height)
     photo = None if shot.path is None else Photo(shot.path, lens, window, width, height)
     return View(shot.name, camera.to(dtype=torch.float32), photo)
