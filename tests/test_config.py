@@ -355,8 +355,6 @@ def test_other_arguments_are_read_as_yaml(written):
         ("name: x", ["nmae=y"], "config: unknown key 'nmae'. Did you mean 'name'?"),
         ("", [], "run.yaml: is empty, expected keys such as data_type"),
         ("# nothing yet", [], "run.yaml: is empty"),
-        ("hello", [], "run.yaml: unknown key 'hello'"),
-        ("system: {renderer: {}}", ["renderer.backend=cpu"], "unknown key 'renderer'. Did you mean 'system.renderer'?"),
         ("name: x", ["system..a=1"], "'system..a' is no key: a part of it is empty"),
         ("name: x", ["system.=1"], "'system.' is no key: a part of it is empty"),
         ("name: x", ["system.a=${system.b}"], "system.a: "),

@@ -380,22 +380,12 @@ def load_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: A
     return read_config(merge_config(*yamls, cli_args=cli_args, **overrides))
 
 
-_SECTIONS = ("data", "system", "trainer", "checkpoint")
-
-
 def _check_first(merged: DictConfig) -> None:
     """Raise ConfigError for what other keys are worked out from, so that none of these is blamed."""
-    for key in _SECTIONS:
+    for key in ("data", "system", "trainer", "checkpoint"):
         section = OmegaConf.select(merged, key)
         if key in merged and section is not None and not isinstance(section, DictConfig):
             raise ConfigError(f"{key}: got {_show(section)}, expected dict ({key}.<key>=<value>).")
-    known = [f.name for f in dataclasses.fields(ExperimentConfig)]
-    for key in (key for key in merged if key not in known):
-        inside = [
-            f"{name}.{key}" for name in ("system", "data", "trainer", "checkpoint") if key in (merged.get(name) or ())
-        ]
-        if inside:
-            raise ConfigError(f"config: unknown key '{key}'. Did you mean '{inside[0]}'? Known: {', '.join(known)}.")
     try:
         steps = OmegaConf.select(merged, "trainer.max_steps")
     except OmegaConfBaseException:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.data.camera import Cameras, look_at
 from dreamcatalyst.data.orbit import FOV, MARGIN, common_point, orbit_capture, video_path
 from dreamcatalyst.data.views import CaptureOptions
@@ -129,8 +130,8 @@ def test_one_splat_and_none():
     assert_looks_at(cameras, one.means[0])
     with pytest.raises(DataError, match="zero splats"):
         orbit_capture(one[:0], CaptureOptions())
-    with pytest.raises(ConfigError, match="data.orbit_up: unknown axis 'w'.*Known: -x, -y, -z, x, y, z"):
-        CaptureOptions(orbit_up="w")
+    with pytest.raises(ConfigError, match="data.orbit_up: unknown orbit_up value 'w'.*Known: -x, -y, -z, x, y, z"):
+        parse(CaptureOptions, {"orbit_up": "w"}, "data")
 
 
 # --- the common point

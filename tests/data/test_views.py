@@ -106,11 +106,6 @@ def test_options_that_cannot_be(options, message):
         parse(CaptureOptions, options, "data")
 
 
-def test_names_are_checked_whatever_the_source_is():
-    with pytest.raises(DreamCatalystError, match="data.format: unknown format 'blender'.*nerfstudio"):
-        parse(CaptureOptions, {"format": "blender"}, "data")
-
-
 def test_photographs_of_more_pixels_than_pillow_takes_are_opened(tmp_path, monkeypatch):
     """Pillow refuses twice MAX_IMAGE_PIXELS; panoramas have more. What bounds them is memory."""
     from PIL import Image

@@ -54,7 +54,7 @@ class Photo:
 
 
 def there(path: Path) -> bool:
-    """Whether there is such a file or folder; under a name that none can have, such as a very long one, there is not."""
+    """Whether there is such a file or folder; under a name that none can have, a very long one, there is not."""
     try:
         return path.exists()
     except OSError:

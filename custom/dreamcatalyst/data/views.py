@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..config import AtLeastOne, Colour, Count, NonNegative, Range, Side
-from ..errors import DataError, choose
+from ..errors import DataError
 from ..memory import free_memory
 from ..registry import Registry
 from .camera import Cameras
@@ -28,9 +28,6 @@ FORMATS = Registry("dataset format", __package__)
 FORMATS.add("colmap", ".colmap:FORMAT")
 FORMATS.add("inria", ".inria:FORMAT")
 FORMATS.add("nerfstudio", ".transforms:FORMAT")
-AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")}  # what data.orbit_up may name
-
-
 AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")}  # what data.orbit_up may name
 
 
@@ -53,9 +50,6 @@ class CaptureOptions:
     orbit_up: str = field(default="-y", metadata={"choices": AXES})  # up in them: -y suits COLMAP's, z nerfstudio's
 
     def __post_init__(self) -> None:
-        if self.format is not None:
-            choose("format", self.format, FORMATS.names(), "data.format")
-        choose("axis", self.orbit_up, AXES, "data.orbit_up")
         sized = self.width is not None or self.height is not None
         if self.downscale != 1 and sized:
             raise DataError("data.downscale and data.width or data.height: both set a size; leave one of them out")
