@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from dreamcatalyst.config import parse
 from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.loss.anchor import AnchorConfig, anchor_loss, anchor_step
 from dreamcatalyst.scene.edit import Splats
@@ -132,8 +133,8 @@ CASES = [
         "weight 1e4, loss, 100 steps of Adam": descended("loss", 1e4),
         "weight 1e4, proximal, 100 steps of Adam": descended("proximal", 1e4),
         "weights without end": lambda: [
-            refused(ConfigError, "weight_init_g0", lambda: config("loss", float("inf"))),
-            refused(ConfigError, "weight_init_g0", lambda: config("loss", float("nan"))),
+            refused(ConfigError, "weight_init_g0", lambda: parse(AnchorConfig, {"weight_init_g0": float("inf")})),
+            refused(ConfigError, "weight_init_g0", lambda: parse(AnchorConfig, {"weight_init_g0": float("nan")})),
         ],
     }.items()
 ]

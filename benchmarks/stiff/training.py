@@ -252,10 +252,10 @@ def poisoned(at: int, factor: float) -> Iterator[None]:
     step_loss = FitSystem.step_loss
 
     def poisoned_loss(self, batch, number):
-        loss, *others = step_loss(self, batch, number)
+        terms, *others = step_loss(self, batch, number)
         if number == at:
-            loss.register_hook(lambda gradient: gradient * factor)
-        return loss, *others
+            terms["photometric"].register_hook(lambda gradient: gradient * factor)
+        return terms, *others
 
     with mock.patch.object(FitSystem, "step_loss", poisoned_loss):
         yield
