@@ -477,3 +477,14 @@ def test_what_cannot_be_worked_out_names_its_expression(written):
 def test_the_name_of_a_source_that_is_left_empty_is_empty(written):
     path = written("tag: x${basename:${data.source}}\ndata:\n  source: null\n")
     assert load_config(path).tag == "x"
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [("system.loss=[]", "system.loss: got [] (list), expected keys of their own"), ("system.loss=[1]", "system.loss:")],
+)
+def test_a_list_in_the_place_of_a_section_is_refused(tmp_path, given, said):
+    (tmp_path / "a.yaml").write_text("tag: x\nsystem: {loss: {lambda_outside: 1.0}}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as error:
+        load_config(tmp_path / "a.yaml", cli_args=[given])
+    assert said in str(error.value)

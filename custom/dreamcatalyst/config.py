@@ -344,10 +344,25 @@ def merge_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: 
     """YAML files merged from left to right, then `key.sub=value` arguments, then `overrides`; nothing is resolved, so
     that what follows from another key still does. Raises ConfigError."""
     _register_resolvers()
-    merged = OmegaConf.merge(*[_read(Path(path)) for path in yamls], _dotlist(cli_args), overrides)
+    parts = [*(_read(Path(path)) for path in yamls), _dotlist(cli_args), OmegaConf.create(overrides)]
+    merged = parts[0]
+    for part in parts[1:]:
+        _require_keys(OmegaConf.to_container(merged), OmegaConf.to_container(part))
+        merged = OmegaConf.merge(merged, part)
     for key in missing_keys(OmegaConf.to_container(merged)):
         raise ConfigError(f"{key}: a value is needed, and none is given. Add {key}=... to the command.")
     return merged
+
+
+def _require_keys(below: Any, above: Any, where: str = "") -> None:
+    """Raise ConfigError where a section, or a list, is to be replaced by the other: OmegaConf merges neither."""
+    if isinstance(below, dict) and isinstance(above, dict):
+        for key in below.keys() & above.keys():
+            _require_keys(below[key], above[key], f"{where}.{key}" if where else str(key))
+    elif isinstance(below, dict) and isinstance(above, list):
+        raise ConfigError(f"{where}: got {_show(above)}, expected keys of their own: {', '.join(map(str, below))}.")
+    elif isinstance(below, list) and isinstance(above, dict):
+        raise ConfigError(f"{where}: got {_show(above)}, expected a list such as {_show(below)}.")
 
 
 def read_config(merged: DictConfig, below: Callable[[], Iterable[str]] = tuple) -> ExperimentConfig:
