@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -33,3 +33,13 @@ def gradient_shares(terms: Mapping[str, Tensor], parameters: Mapping[str, Tensor
     shares = every[:, moved] / sums[moved]
     means = shares.mean(1).tolist() if bool(moved.any()) else [0.0] * len(norms)
     return dict(zip(norms, means, strict=True))
+
+
+@torch.no_grad()
+def update_share(before: Sequence[Tensor], between: Sequence[Tensor], after: Sequence[Tensor]) -> float:
+    """The share of a second step (between to after) in what it and a first one (before to between) move, in [0,1]: by
+    their norms, parameter by parameter, averaged over those that move at all; 0 where none does."""
+    first = torch.stack([(b - a).norm() for a, b in zip(before, between, strict=True)])
+    second = torch.stack([(c - b).norm() for b, c in zip(between, after, strict=True)])
+    moved = first + second > 0
+    return float((second[moved] / (first + second)[moved]).mean()) if bool(moved.any()) else 0.0

@@ -301,7 +301,7 @@ class EditSystem(SplatSystem):
             distance = self.perceptual(shown, given.target)
             terms["perceptual"] = losses.lambda_perceptual * distance
             numbers["perceptual"] = float(distance.detach())
-        if self.generations is not None:
+        if self.generations is not None and self.part["anchor"].form == "loss":
             terms["anchor"] = anchor_loss(self.splats, self.generations, self.part["anchor"])
             numbers["anchor"] = float(terms["anchor"].detach())
         return terms, render, numbers

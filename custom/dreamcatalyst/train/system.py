@@ -17,7 +17,7 @@ from ..data.camera import Cameras
 from ..data.views import Capture
 from ..diffusion.noise import keyed_generator
 from ..errors import ConfigError, NumericalError, SceneError, choose
-from ..loss.terms import gradient_shares, total
+from ..loss.terms import gradient_shares, total, update_share
 from ..render.api import Backend, Render, find_backend, rasterize
 from ..render.frozen import Frozen
 from ..report.clip import ClipJudge
@@ -262,7 +262,9 @@ class SplatSystem(System):
         require_finite("loss", loss=loss)
         render.means2d.retain_grad()
         optimizer.zero_grad()
-        if len(terms) > 1 and self.record.wanted(step + 1, self.max_steps):
+        wanted = self.record.wanted(step + 1, self.max_steps)
+        pulled = self.generations is not None and "anchor" not in terms
+        if len(terms) > 1 and wanted:
             with stage(LOGGING):
                 shares = gradient_shares(terms, self.splats.parameters)
             render.means2d.grad = None  # what arrived there on the way is not the step's
@@ -275,7 +277,10 @@ class SplatSystem(System):
             kept = kept_copy(self.splats.parameters)
             with self.splats.scaled_update():
                 optimizer.step()
+                moved = kept_copy(self.splats.parameters) if wanted and pulled else None
                 self.after_update()
+                if moved is not None:  # an anchor that is a step of its own has no gradient
+                    numbers["share_anchor_step"] = update_share(kept, moved, list(self.splats.parameters.values()))
             try:
                 require_finite("optimizer", **self.splats.parameters)
             except NumericalError:
