@@ -265,7 +265,7 @@ def test_the_edit_runs_in_the_host_and_is_validated_and_exported_from_its_checkp
     short += ["data.source=null", "system.gs_source=given.ply"]
     done = in_host(host, "--train", *short)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
-    assert "opened 2 times" in done.stdout  # where it lies, and then the splats
+    assert "opened 3 times" in done.stdout  # where it lies, how it was fitted, and then the splats
     (trial,) = (host / "outputs/seam").iterdir()
     assert list(trial.glob("save/**/*.ply")), sorted(trial.rglob("*"))
     (checkpoint,) = trial.glob(f"ckpts/*step={STEPS}.ckpt")

@@ -53,7 +53,7 @@ class Record:
         clock = self.clock
         with clock.stage(LOGGING):
             row = {"step": step, "seconds": round(clock.seconds, 3), "splats": system.splats.total}
-            row |= {f"seconds_{name}": round(value, 3) for name, value in clock.stages.items()}
+            row |= {f"seconds_{name}": round(value, 6) for name, value in clock.stages.items()}
             memory = peak_memory(system.root_device)
             row |= {} if memory is None else {"memory_mib": round(memory, 1)}
             row |= {"skipped": self.skipped} if self.skipped else {}
