@@ -130,8 +130,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
         fitted = None
         if capture:
-            run(args.root, args.python, "configs/fit.yaml", [*RUN, f"data.source={capture}"], Path(folder))
-            fitted = next(Path(folder).rglob("save/last.ply"))
+            for name in ("compiles", "kept"):
+                run(args.root, args.python, "configs/fit.yaml", [*RUN, f"data.source={capture}"], Path(folder) / name)
+            fitted = next((Path(folder) / "kept").rglob("save/last.ply"))
         jobs = runs(args.root, capture)
         results = dict(pool.map(lambda job: measure(args.root, args.python, job, fitted), jobs))
     for name, result in results.items():
