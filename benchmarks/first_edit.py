@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--splats", help="PLY of the capture's splats, from configs/fit.yaml")
     parser.add_argument("--instructions", nargs="+", default=INSTRUCTIONS)
     parser.add_argument("--steps", type=int, default=800)
-    parser.add_argument("--plot", type=Path, help="PNG of the error curves to write")
+    parser.add_argument("--plot", type=Path, help="SVG of the error curves to write")
     parser.add_argument("--picture", type=Path, help="PNG of the edits side by side to write")
     parser.add_argument("overrides", nargs="*", help="key=value for all runs, such as data.downscale=4")
     args = parser.parse_args()
@@ -104,13 +104,15 @@ def main() -> None:
         if args.picture:
             picture(folder, rows, args.picture)
         if args.plot:
-            from dreamcatalyst.report.curve import draw_curves
+            from dreamcatalyst.report.chart import line_chart, picture_file
 
-            curves = {}
+            charts = []
             for row in rows:
-                curves[row["instruction"]] = curve(folder, row["name"])
-                curves[f"{row['instruction']}, ceiling"] = curve(folder, f"{row['name']}-ceiling")
-            draw_curves(args.plot, curves, {"PSNR against the known edit, dB": ["psnr_edit"]})
+                runs = {"rule": row["name"], "ceiling": f"{row['name']}-ceiling"}
+                curves = {label: curve(folder, name).rows for label, name in runs.items()}
+                lines = {k: [(r["seconds"], r["psnr_edit"]) for r in v if "psnr_edit" in r] for k, v in curves.items()}
+                charts.append(line_chart(f"{row['instruction']}: PSNR against the known edit, dB", lines))
+            args.plot.write_text(picture_file(charts), encoding="utf-8")
     print("\nPSNR (dB) of held-out views against the known edit\n")
     print("| instruction | unedited | rule | ceiling | below it | SSIM rule | SSIM ceiling | steps | seconds |")
     print("|---|---|---|---|---|---|---|---|---|")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import signal
@@ -12,9 +13,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import torch
+
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+THREADS = max(1, (os.cpu_count() or 1) // WORKERS)
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # read by torch when it is imported, and by child processes
+    os.environ.setdefault(_name, str(THREADS))
+os.environ.setdefault("NUMBA_NUM_THREADS", str(max(2, THREADS)))  # two: tests show that their number changes no bit
+
+import torch  # noqa: E402
 
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever started the tests may have had it ignored (nohup)
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One worker for each core; none where a single file is asked for, which starts faster without."""
+    paths = [Path(argument.split("::")[0]) for argument in config.args]
+    single = len(paths) == 1 and paths[0].is_file()
+    return 0 if single else (os.cpu_count() or 1)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from dreamcatalyst.diffusion.noise import stable_diffusion_schedule
 from dreamcatalyst.guidance.guidance import GuidanceConfig, chosen_rule, chosen_schedule
 from dreamcatalyst.scene.generations import Generations
 from dreamcatalyst.train.edit import EditSystem
-from dreamcatalyst.train.plan import density_steps
 
 import launch
 from tests.test_main_job import flat
@@ -92,7 +91,7 @@ def test_schedules_go_as_published(mode, steps, times, last):
     schedule, abar = chosen_schedule(guidance, rule), stable_diffusion_schedule()
     assert schedule.timestep(0, steps, abar) == 901 and schedule.timestep(steps - 1, steps, abar) == last
     densify = parse(EditSystem.parts["densify"], system["densify"], "system.densify")
-    assert (densify.every, densify.start, density_steps(densify, steps)) == (100, 100, times)
+    assert (densify.every, densify.start, densify.times(steps)) == (100, 100, times)
 
 
 def test_the_first_generation_is_held_as_published():
@@ -102,7 +101,7 @@ def test_the_first_generation_is_held_as_published():
     assert (anchor.weight_init_g0, anchor.weight_init, anchor.weight_multiplier) == (0.05, 0.1, 1.3)
     given = anchor.weight_init_g0, anchor.weight_init, anchor.weight_multiplier, anchor.max_weight
     generations = Generations(*given, anchor="source", anchored=())
-    for _ in range(density_steps(parse(EditSystem.parts["densify"], system["densify"]), 1500)):
+    for _ in range(parse(EditSystem.parts["densify"], system["densify"]).times(1500)):
         generations.advance(None)
     assert generations.weights[0] == pytest.approx(1.165, abs=5e-4)
 

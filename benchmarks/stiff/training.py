@@ -24,7 +24,7 @@ from dreamcatalyst.scene.mask import threshold
 from dreamcatalyst.scene.ply import read_ply, write_ply
 from dreamcatalyst.scene.plyfile import read_vertices
 from dreamcatalyst.train.densify import DensifyConfig, densify, observe, screen_statistics
-from dreamcatalyst.train.fit import FitSystem
+from dreamcatalyst.train.fit import FitMethod
 from dreamcatalyst.train.optim import LearningRates
 from torch import Tensor
 
@@ -249,7 +249,7 @@ def far_away() -> list[Check]:
 @contextmanager
 def poisoned(at: int, factor: float) -> Iterator[None]:
     """Fits whose loss has at step `at` a derivative times `factor`."""
-    step_loss = FitSystem.step_loss
+    step_loss = FitMethod.step_loss
 
     def poisoned_loss(self, batch, number):
         terms, *others = step_loss(self, batch, number)
@@ -257,7 +257,7 @@ def poisoned(at: int, factor: float) -> Iterator[None]:
             terms["photometric"].register_hook(lambda gradient: gradient * factor)
         return terms, *others
 
-    with mock.patch.object(FitSystem, "step_loss", poisoned_loss):
+    with mock.patch.object(FitMethod, "step_loss", poisoned_loss):
         yield
 
 

@@ -38,6 +38,10 @@ class Registry:
             self._targets[name] = target
         return target
 
+    def parts(self) -> list[Any]:
+        """All registered parts, in the order of their registration."""
+        return [self.get(name) for name in list(self._targets)]
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())
 

@@ -15,6 +15,8 @@ from dreamcatalyst.scene.gaussians import PARAMETERS
 from dreamcatalyst.scene.ply import read_ply, write_ply
 from dreamcatalyst.train import densify
 from dreamcatalyst.train.edit import EditSystem
+from dreamcatalyst.train.editing import EditMethod
+from dreamcatalyst.train.source import SourceViews
 
 import launch as launcher
 from tests.device.far import DeviceError, Far, install
@@ -49,8 +51,8 @@ def seen(device, monkeypatch):
     def spy(self, batch, number):
         device.waits = Counter()
         out = step(self, batch, number)
-        held = [*self.splats.parameters.values(), *self.splats.state.values()]
-        held += [v for s in self.splats.optimizer.state.values() for v in s.values()]
+        held = [*self.method.splats.parameters.values(), *self.method.splats.state.values()]
+        held += [v for s in self.method.splats.optimizer.state.values() for v in s.values()]
         clock = device.waits.pop("clock", 0)
         steps.append((Counter(device.waits), clock, all(isinstance(value, Far) for value in held)))
         return out
@@ -111,8 +113,8 @@ def a_background_on_the_cpu(monkeypatch):
 
 
 def a_source_on_the_cpu(monkeypatch):
-    view = EditSystem.source_view
-    monkeypatch.setattr(EditSystem, "source_view", lambda self, index: (view(self, index)[0].cpu(), None))
+    view = SourceViews.view
+    monkeypatch.setattr(SourceViews, "view", lambda self, index: (view(self, index)[0].cpu(), None))
 
 
 PLANTS = [cameras_left_on_the_cpu, a_network_left_on_the_cpu, a_background_on_the_cpu, a_source_on_the_cpu]
@@ -127,7 +129,7 @@ def test_a_mistake_in_the_product_is_seen(device, run, monkeypatch, plant):
 
 def test_statistics_on_the_cpu_are_seen(device, launch, few, monkeypatch):  # noqa: F811
     monkeypatch.setattr(
-        "dreamcatalyst.train.system.screen_statistics",
+        "dreamcatalyst.train.densify.screen_statistics",
         lambda splats: {name: torch.zeros(len(splats)) for name in densify.STATISTICS},
     )
     with pytest.raises(DeviceError):
@@ -136,14 +138,14 @@ def test_statistics_on_the_cpu_are_seen(device, launch, few, monkeypatch):  # no
 
 def test_a_look_at_each_splat_is_seen(seen, run, monkeypatch):
     """What no device refuses, and what makes a step slow: counted."""
-    step_loss = EditSystem.step_loss
+    step_loss = EditMethod.step_loss
 
     def looking(self, batch, step):
         for opacity in self.splats.parameters["logit_opacities"][:100]:
             opacity.item()
         return step_loss(self, batch, step)
 
-    monkeypatch.setattr(EditSystem, "step_loss", looking)
+    monkeypatch.setattr(EditMethod, "step_loss", looking)
     run("configs/dc-splat.yaml")
     ((waits, *_),) = seen
     assert sum(waits.values()) > 100 > MOST_WAITS

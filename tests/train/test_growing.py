@@ -12,7 +12,8 @@ from dreamcatalyst.report.metrics import psnr
 from dreamcatalyst.scene.gaussians import PARAMETERS
 from dreamcatalyst.scene.ply import read_ply
 from dreamcatalyst.train.densify import DensifyConfig, candidate_children, candidate_parents, densify
-from dreamcatalyst.train.edit import EditSystem, widened
+from dreamcatalyst.train.editing import EditMethod
+from dreamcatalyst.train.region import dilate
 
 from tests.train.test_densify import generator, make_splats, with_gradient
 from tests.train.test_runs import rows
@@ -22,19 +23,19 @@ BOX = "system.mask={kind: box, options: {low: [-0.36, -0.36, -0.02], high: [0.42
 
 def gradients_above_the_outline(launch, monkeypatch, *options):
     """Of guidance and outside terms in the render, summed over pixels that only the new hat covers at the start."""
-    found, step_loss = {}, EditSystem.step_loss
+    found, step_loss = {}, EditMethod.step_loss
 
     def spy(self, batch, step):
         terms, render, numbers = step_loss(self, batch, step)
         index = batch["index"][0]
-        above = self.region(index).bool() & (self.source_view(index)[1] < 1e-3)
+        above = self.region(index).bool() & (self.source.view(index)[1] < 1e-3)
         for name, term in terms.items():
             if term.requires_grad:
                 grad = torch.autograd.grad(term, render.rgb, retain_graph=True)[0][0]
                 found[name] = float((grad * above).abs().sum() / above.sum())
         return terms, render, numbers
 
-    monkeypatch.setattr(EditSystem, "step_loss", spy)
+    monkeypatch.setattr(EditMethod, "step_loss", spy)
     launch("grow.yaml", "data.width=64", "data.height=64", BOX, "trainer.max_steps=1", *options)
     monkeypatch.undo()
     return found
@@ -51,9 +52,9 @@ def test_guidance_reaches_beyond_the_outline(launch, monkeypatch):
 def test_a_share_is_widened_by_its_reach():
     share = torch.zeros(1, 20, 30, 1)
     share[0, 10, 15] = 0.7
-    wide = widened(share, 0.1)  # 3 pixels of 30
+    wide = dilate(share, 0.1)  # 3 pixels of 30
     assert wide[0, 7:14, 12:19].eq(0.7).all() and float(wide.sum()) == pytest.approx(0.7 * 49)
-    assert torch.equal(widened(share, 0.0), share)
+    assert torch.equal(dilate(share, 0.0), share)
 
 
 @pytest.mark.parametrize("size", [8, 16])

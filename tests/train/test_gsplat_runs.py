@@ -12,9 +12,9 @@ from dreamcatalyst.render import gsplat
 from dreamcatalyst.render.api import BACKENDS
 from dreamcatalyst.scene.gaussians import PARAMETERS
 from dreamcatalyst.scene.ply import read_ply, write_ply
-from dreamcatalyst.train import edit
-from dreamcatalyst.train.edit import EditSystem
-from dreamcatalyst.train.fit import FitSystem
+from dreamcatalyst.train import editing
+from dreamcatalyst.train.editing import EditMethod
+from dreamcatalyst.train.fit import FitMethod
 
 from tests.train.test_confined import GROWING, MASK, inside
 
@@ -63,8 +63,8 @@ def test_the_same_edit_as_by_the_cpu(launch, gsplat_here, statue):
         assert (getattr(ours, name) - getattr(theirs, name)).norm() <= 0.05 * moved, name
 
 
-@pytest.mark.parametrize("config, loads", [("closed-form.yaml", (EditSystem, "make_splats")),
-                                           ("fit.yaml", (FitSystem, "first_scene"))])  # fmt: skip
+@pytest.mark.parametrize("config, loads", [("closed-form.yaml", (EditMethod, "make_splats")),
+                                           ("fit.yaml", (FitMethod, "first_scene"))])  # fmt: skip
 def test_a_machine_that_cannot_draw_is_told_before_anything_is_loaded(launch, monkeypatch, capsys, config, loads):
     def refuse():
         raise SceneError("rasterize: backend 'gsplat' lacks nvcc")
@@ -74,20 +74,20 @@ def test_a_machine_that_cannot_draw_is_told_before_anything_is_loaded(launch, mo
 
     monkeypatch.setitem(BACKENDS._targets, "gsplat", replace(gsplat.BACKEND, devices=(), prepare=refuse))
     monkeypatch.setattr(*loads, none)
-    monkeypatch.setattr(edit, "Guidance", none)
+    monkeypatch.setattr(editing, "Guidance", none)
     launch(config, "trainer.max_steps=1", "system.renderer.backend=gsplat", status=2)
     assert "lacks nvcc" in capsys.readouterr().err
 
 
 def test_gsplat_on_a_cpu_is_refused_before_anything_is_loaded(launch, monkeypatch, capsys):
-    monkeypatch.setattr(edit, "Guidance", lambda *_, **__: pytest.fail("loaded all the same"))
+    monkeypatch.setattr(editing, "Guidance", lambda *_, **__: pytest.fail("loaded all the same"))
     launch("closed-form.yaml", "trainer.max_steps=1", "system.renderer.backend=gsplat", status=2)
     assert "expected torch.float32 on cuda" in capsys.readouterr().err
 
 
 def test_mixed_precision_does_not_reach_the_backward_pass(launch, monkeypatch):
     """Lightning calls all of a step under autocast; products of the backward pass would lose their digits there."""
-    seen, step_loss = {"forward": set(), "backward": set()}, EditSystem.step_loss
+    seen, step_loss = {"forward": set(), "backward": set()}, EditMethod.step_loss
 
     def spy(self, batch, step):
         loss, render, numbers = step_loss(self, batch, step)
@@ -95,6 +95,6 @@ def test_mixed_precision_does_not_reach_the_backward_pass(launch, monkeypatch):
         render.rgb.register_hook(lambda _: seen["backward"].add(torch.is_autocast_enabled("cpu")))
         return loss, render, numbers
 
-    monkeypatch.setattr(EditSystem, "step_loss", spy)
+    monkeypatch.setattr(EditMethod, "step_loss", spy)
     launch("closed-form.yaml", *PLAIN, "trainer.max_steps=1", "trainer.precision=bf16-mixed")
     assert seen == {"forward": {True}, "backward": {False}}

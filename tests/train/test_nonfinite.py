@@ -10,8 +10,8 @@ import torch
 from dreamcatalyst.diffusion.closed_form import ClosedForm
 from dreamcatalyst.errors import NumericalError
 from dreamcatalyst.scene.ply import read_ply
-from dreamcatalyst.train.edit import EditSystem
-from dreamcatalyst.train.finite import give_back, gradient_norms, kept_copy, require_finite
+from dreamcatalyst.train.editing import EditMethod
+from dreamcatalyst.train.finite import gradient_norms, require_finite, restore, snapshot
 
 from tests.train.test_runs import assert_same_splats
 
@@ -20,18 +20,18 @@ NAN, INF = math.nan, math.inf
 
 
 def spoil_render(monkeypatch, value, now):
-    draw = EditSystem.draw_now
+    draw = EditMethod.draw_now
 
     def spoilt(self, cameras):
         render = draw(self, cameras)
         bad = now(self) and torch.is_grad_enabled()
         return replace(render, rgb=render.rgb * value) if bad else render
 
-    monkeypatch.setattr(EditSystem, "draw_now", spoilt)
+    monkeypatch.setattr(EditMethod, "draw_now", spoilt)
 
 
 def spoil_guidance(monkeypatch, value, now):
-    predict, step_loss, at = ClosedForm.predict_noise, EditSystem.step_loss, []
+    predict, step_loss, at = ClosedForm.predict_noise, EditMethod.step_loss, []
 
     def noted(self, batch, step):
         at[:] = [now(self)]
@@ -44,12 +44,12 @@ def spoil_guidance(monkeypatch, value, now):
             out[0][0, 0, 0, 0] = value
         return out
 
-    monkeypatch.setattr(EditSystem, "step_loss", noted)
+    monkeypatch.setattr(EditMethod, "step_loss", noted)
     monkeypatch.setattr(ClosedForm, "predict_noise", spoilt)
 
 
 def spoil_backward(monkeypatch, value, now):
-    step_loss = EditSystem.step_loss
+    step_loss = EditMethod.step_loss
 
     def spoilt(self, batch, step):
         terms, render, numbers = step_loss(self, batch, step)
@@ -57,16 +57,16 @@ def spoil_backward(monkeypatch, value, now):
             terms["guidance"].register_hook(lambda gradient: gradient * value)
         return terms, render, numbers
 
-    monkeypatch.setattr(EditSystem, "step_loss", spoilt)
+    monkeypatch.setattr(EditMethod, "step_loss", spoilt)
 
 
 def spoil_update(monkeypatch, value, now):
     def spoilt(self):
-        if self.true_global_step == AT + 1:  # the optimizer's step counts
+        if self.context.step() == AT + 1:  # the optimizer's step counts
             with torch.no_grad():
                 self.splats.parameters["quats"][5, 1] = value
 
-    monkeypatch.setattr(EditSystem, "after_update", spoilt)
+    monkeypatch.setattr(EditMethod, "after_update", spoilt)
 
 
 PLACES = {  # what is put in: (how, value, the words that name it)
@@ -94,7 +94,7 @@ def assert_finite(trial):
 @pytest.mark.parametrize("name", PLACES)
 def test_a_run_stops_with_the_place_and_leaves_the_last_good_state(launch, capsys, monkeypatch, name):
     spoil, value, words = PLACES[name]
-    spoil(monkeypatch, value, lambda system: system.true_global_step == AT)
+    spoil(monkeypatch, value, lambda method: method.context.step() == AT)
     trial = launch("closed-form.yaml", "trainer.max_steps=6", "system.report.every=0", status=2)
     told = capsys.readouterr().err
     for word in (f"step {AT}", "timestep ", "view 00", *words, "last.ckpt"):
@@ -112,7 +112,7 @@ def test_a_run_stops_with_the_place_and_leaves_the_last_good_state(launch, capsy
 @pytest.mark.parametrize("name", [name for name in PLACES if "Inf" not in name])
 def test_a_step_can_be_left_out_and_is_counted(launch, capsys, monkeypatch, name):
     spoil, value, words = PLACES[name]
-    spoil(monkeypatch, value, lambda system: system.true_global_step == AT)
+    spoil(monkeypatch, value, lambda method: method.context.step() == AT)
     options = ["trainer.max_steps=6", "system.report.every=1", "system.nonfinite=skip"]
     trial = launch("closed-form.yaml", *options)
     told = capsys.readouterr().err
@@ -154,8 +154,8 @@ def test_norms_are_those_of_the_gradients():
 
 def test_a_parameter_gets_back_what_it_was():
     parameters = {"a": torch.nn.Parameter(torch.ones(2))}
-    kept = kept_copy(parameters)
+    kept = snapshot(parameters)
     with torch.no_grad():
         parameters["a"].fill_(NAN)
-    give_back(parameters, kept)
+    restore(parameters, kept)
     assert torch.equal(parameters["a"], torch.ones(2))

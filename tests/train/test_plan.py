@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from dreamcatalyst.train import edit
-from dreamcatalyst.train.densify import DensifyConfig
-from dreamcatalyst.train.plan import Plan, density_steps, readable, scene_bytes
+from dreamcatalyst.train.density import DensifyConfig
+from dreamcatalyst.train.editing import EditMethod
+from dreamcatalyst.train.plan import Plan, readable, scene_bytes
 
 from tests.train.test_confined import ANCHORED, MASK
 
@@ -19,16 +19,16 @@ def tensor_size(*tensors: torch.Tensor) -> int:
 
 
 @pytest.fixture
-def run(launch, monkeypatch) -> Callable[..., tuple[edit.EditSystem, Plan, dict]]:
-    """Launch and return the system after the run, its plan, and what was counted in its last step."""
+def run(launch, monkeypatch) -> Callable[..., tuple[EditMethod, Plan, dict]]:
+    """Launch and return the method after the run, its plan, and what was counted in its last step."""
 
     def go(*options: str):
         seen: dict = {"rows": 0, "pixels": 0}
-        real = edit.EditSystem.plan
+        real = EditMethod.plan
 
-        def spy(system):
-            seen["system"], seen["plan"] = system, real(system)
-            predict, draw = system.guidance.prior.predict_noise, system.draw_now
+        def spy(method):
+            seen["method"], seen["plan"] = method, real(method)
+            predict, draw = method.guidance.prior.predict_noise, method.draw_now
 
             def counted(rows, timestep):
                 seen["rows"] += sum(len(row.noisy) for row in rows)
@@ -40,13 +40,13 @@ def run(launch, monkeypatch) -> Callable[..., tuple[edit.EditSystem, Plan, dict]
                     seen["pixels"] += render.rgb[..., 0].numel()
                 return render
 
-            monkeypatch.setattr(system.guidance.prior, "predict_noise", counted)
-            monkeypatch.setattr(system, "draw_now", drawn)
+            monkeypatch.setattr(method.guidance.prior, "predict_noise", counted)
+            monkeypatch.setattr(method, "draw_now", drawn)
             return seen["plan"]
 
-        monkeypatch.setattr(edit.EditSystem, "plan", spy)
+        monkeypatch.setattr(EditMethod, "plan", spy)
         launch("closed-form.yaml", "trainer.max_steps=1", "system.report.every=0", *options)
-        return seen["system"], seen["plan"], seen
+        return seen["method"], seen["plan"], seen
 
     return go
 
@@ -75,17 +75,17 @@ def test_rows_and_pixels_of_a_step(run, options, rows):
 
 @pytest.mark.parametrize("options", [[], [MASK, "system.mask.feather=0.05"], [MASK, *ANCHORED], ANCHORED])
 def test_memory_is_that_of_the_tensors(run, options):
-    system, plan, _ = run(*options)
-    splats = system.splats
+    method, plan, _ = run(*options)
+    splats = method.splats
     values = [t for p in splats.parameters.values() for t in (p, p.grad)]
     moments = [v for s in splats.optimizer.state.values() for k, v in s.items() if k != "step"]
     anchors = [v for k, v in splats.state.items() if k.startswith("anchor_") or k == "generation"]
     state = [v for k, v in splats.state.items() if not (k.startswith("anchor_") or k == "generation")]
     assert size(plan, "editable splats") == tensor_size(*values, *moments, *state)
-    assert size(plan, "source") == scene_bytes(system.source)
+    assert size(plan, "source") == scene_bytes(method.source.scene)
     if splats.frozen is not None:
         assert size(plan, "frozen splats") == scene_bytes(splats.frozen)
-        assert 0 < system.frozen.kept.bytes <= size(plan, "renders of frozen splats")
+        assert 0 < method.frozen.kept.bytes <= size(plan, "renders of frozen splats")
     if anchors:
         assert size(plan, "anchors") == tensor_size(*anchors)
 
@@ -98,16 +98,16 @@ def test_a_fit_has_a_plan_without_a_prior(launch):
 
 
 def test_what_is_left_out_is_not_there(run):
-    system, plan, _ = run()
+    method, plan, _ = run()
     assert {"frozen splats", "anchors", "perceptual network", "densification"} <= {p.name for p in plan.leaves_out}
-    assert system.splats.frozen is None and system.frozen is None
-    assert system.generations is None and not [k for k in system.splats.state if k.startswith("anchor_")]
-    assert system.perceptual is None
+    assert method.splats.frozen is None and method.frozen is None
+    assert method.generations is None and not [k for k in method.splats.state if k.startswith("anchor_")]
+    assert method.perceptual is None
 
 
 def test_an_anchor_is_kept_for_what_weighs_only(run):
-    system, plan, _ = run("system.anchor={kind: source, lambda_color: 0, lambda_geo: 0}")
-    assert {k for k in system.splats.state if k.startswith("anchor_")} == {
+    method, plan, _ = run("system.anchor={kind: source, lambda_color: 0, lambda_geo: 0}")
+    assert {k for k in method.splats.state if k.startswith("anchor_")} == {
         "anchor_logit_opacities",
         "anchor_log_scales",
     }
@@ -122,7 +122,7 @@ def test_times_of_densification(start, stop, max_steps, times):
     """As the training counts: after so many steps, from start on, before stop, and not after the last."""
     config = DensifyConfig(every=100, start=start, stop=stop)
     after = [n for n in range(1, max_steps) if start <= n < stop and n % 100 == 0]
-    assert density_steps(config, max_steps) == len(after) == times
+    assert config.times(max_steps) == len(after) == times
 
 
 def test_sizes_for_people():

@@ -11,9 +11,9 @@ from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.scene.fitted import Fitted
 from dreamcatalyst.scene.ply import read_ply, write_ply
-from dreamcatalyst.train import results
-from dreamcatalyst.train.edit import PromptConfig
-from dreamcatalyst.train.fit import FitSystem
+from dreamcatalyst.report import results
+from dreamcatalyst.train.editing import PromptConfig
+from dreamcatalyst.train.fit import FitMethod
 from dreamcatalyst.train.optim import LearningRates
 
 EVERY_PARAMETER = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
@@ -169,7 +169,7 @@ def test_wrong_input_is_one_clear_error(launch, capsys, override, words):
 
 
 def test_a_gradient_that_is_not_finite_ends_the_run_and_loses_nothing(launch, capsys, monkeypatch):
-    monkeypatch.setattr(FitSystem, "step_loss", poisoned(FitSystem.step_loss, at=3))
+    monkeypatch.setattr(FitMethod, "step_loss", poisoned(FitMethod.step_loss, at=3))
     trial = launch("fit.yaml", "trainer.max_steps=9", status=2)
     told = capsys.readouterr().err
     assert "step 3" in told and "not finite" in told and str(trial / "ckpts" / "last.ckpt") in told

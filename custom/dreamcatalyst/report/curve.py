@@ -1,9 +1,8 @@
-"""Error against run time: a table that grows with the run, and its picture."""
+"""Error against run time: a table that grows with the run."""
 
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -33,31 +32,3 @@ class Curve:
             writer = csv.DictWriter(file, self.columns, restval="")
             writer.writeheader()
             writer.writerows(self.rows)
-
-
-def draw_curves(
-    path: Path,
-    curves: Mapping[str, Curve],
-    groups: Mapping[str, Sequence[str]],
-    lines: Mapping[str, float] | None = None,
-) -> None:
-    """Draw the same columns of several curves, one panel per group, each against seconds."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2 * len(groups), 3.6), layout="constrained")
-    for axis, (label, columns) in zip(figure.subplots(1, len(groups), squeeze=False)[0], groups.items(), strict=True):
-        for title, curve in curves.items():
-            for column in columns:
-                points = [(r["seconds"], r[column]) for r in curve.rows if math.isfinite(r.get(column, math.nan))]
-                if points:
-                    axis.plot(*zip(*points, strict=True), marker=".", label=" ".join(filter(None, (title, column))))
-        axis.set(xlabel="seconds", ylabel=label)
-        axis.grid(alpha=0.3)
-        if axis is figure.axes[0]:
-            for name, level in (lines or {}).items():
-                axis.axhline(level, linestyle="--", linewidth=1, color="gray")
-                axis.annotate(name, (1, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8)
-        if axis.get_legend_handles_labels()[0]:
-            axis.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)

@@ -1,7 +1,8 @@
-"""Measures of images against images. Each is registered by name with its unit and its direction."""
+"""Image metrics. A new one is a function with `@metric(...)`: registered, it is a column of every table and a chart."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,16 +17,25 @@ METRICS = Registry("metric", __package__)
 
 @dataclass(frozen=True)
 class Metric:
-    """A measure that is a mean over pixels: of what, its unit, whether more of it is better.
+    """A measure of an image against a reference that is a mean over pixels.
 
-    pixels: (image, reference) [B,H,W,3] to a value for each pixel, [B,H,W,C]; finish: from their mean to the measure.
+    name: of its columns, "<name>_<reference>". title, unit: for people. better: "higher" or "lower". identity: its
+    value where image and reference are equal. pixels: (image, reference) [B,H,W,3] to a value for each pixel,
+    [B,H,W,C]; finish: from their mean to the measure. costly: while a run goes, only against the first reference.
     """
 
     name: str
+    title: str
     unit: str
-    higher_is_better: bool
+    better: str
+    identity: float
     pixels: Callable[[Tensor, Tensor], Tensor]
     finish: Callable[[Tensor], Tensor] | None = None
+    costly: bool = False
+
+    def label(self, what: str) -> str:
+        """`what`, and the unit."""
+        return f"{what}, {self.unit}" if self.unit else what
 
     def __call__(self, image: Tensor, reference: Tensor, weight: Tensor | None = None) -> Tensor:
         """image, reference [B,H,W,3] in [0,1]; weight [B,H,W,1] in [0,1] or None for all pixels. Returns [B]."""
@@ -38,13 +48,25 @@ class Metric:
         return means if self.finish is None else [self.finish(mean) for mean in means]
 
 
-def metric(name: str, unit: str, *, better: str, finish: Callable[[Tensor], Tensor] | None = None) -> Callable:
-    """Register a function of pixels under `name` (see Metric); better: "higher" or "lower"."""
+def metric(
+    name: str,
+    *,
+    better: str,
+    identity: float,
+    title: str = "",
+    unit: str = "",
+    finish: Callable[[Tensor], Tensor] | None = None,
+    costly: bool = False,
+) -> Callable[[Callable[[Tensor, Tensor], Tensor]], Metric]:
+    """Register a function of pixels under `name`; see Metric. title: the name, if empty. Raises ValueError for a name
+    that is taken or cannot begin a column's ("_" ends it), and for another direction than higher and lower."""
+    if better not in ("higher", "lower") or "_" in name:
+        raise ValueError(f"metric '{name}': better is '{better}', expected higher or lower; the name holds no '_'")
 
-    def add(pixels: Callable) -> Metric:
-        made = Metric(name, unit, better == "higher", pixels, finish)
-        METRICS.add(name, made)
-        return made
+    def add(pixels: Callable[[Tensor, Tensor], Tensor]) -> Metric:
+        row = Metric(name, title or name, unit, better, identity, pixels, finish, costly)
+        METRICS.add(name, row)
+        return row
 
     return add
 
@@ -57,19 +79,21 @@ def _mean(value: Tensor, weight: Tensor | None) -> Tensor:
     return (value.flatten(1) * weight).sum(1) / weight.sum(1)
 
 
-@metric("psnr", "dB", better="higher", finish=lambda mean: -10 * torch.log10(mean))
+@metric(
+    "psnr", title="PSNR", unit="dB", better="higher", identity=math.inf, finish=lambda mean: -10 * torch.log10(mean)
+)
 def psnr(image: Tensor, reference: Tensor) -> Tensor:
     """Peak signal-to-noise ratio for a peak of 1; infinite where the images are equal."""
     return (image - reference) ** 2
 
 
-@metric("ssim", "", better="higher")
+@metric("ssim", title="SSIM", better="higher", identity=1.0, costly=True)
 def ssim(image: Tensor, reference: Tensor) -> Tensor:
     """Structural similarity (Wang et al. 2004), 1 for equal images."""
     return ssim_map(image, reference)
 
 
-@metric("l1", "", better="lower")
+@metric("l1", title="L1", better="lower", identity=0.0)
 def l1(image: Tensor, reference: Tensor) -> Tensor:
     """Mean absolute difference."""
     return (image - reference).abs()
@@ -82,8 +106,7 @@ def compare(
 
     region [H,W,1] of 0 and 1: where the picture is meant to change. With it also "<metric>_source_outside", against the
     source where nothing should have changed (the drift), and "<metric>_<reference>_inside" against all others. A
-    region without a pixel in this view has no score. brief: SSIM, which takes most of the time, against the first
-    reference only.
+    region without a pixel in this view has no score. brief: costly metrics against the first reference only.
     """
     scores = {}
     for name, reference in references.items():
@@ -93,9 +116,9 @@ def compare(
             if bool(weight.any()):
                 weights[f"{name}_{where}"] = weight[None]
         pair = image[None], reference.to(image)[None].clamp(0, 1)
-        for kind in ("psnr", "ssim", "l1"):
-            if brief and kind == "ssim" and name != next(iter(references)):
+        for measure in METRICS.parts():
+            if brief and measure.costly and name != next(iter(references)):
                 continue
-            values = METRICS.get(kind).over(*pair, list(weights.values()))
-            scores |= {f"{kind}_{key}": float(value) for key, value in zip(weights, values, strict=True)}
+            values = measure.over(*pair, list(weights.values()))
+            scores |= {f"{measure.name}_{key}": float(value) for key, value in zip(weights, values, strict=True)}
     return scores

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, get_type_hints
 
 from .. import plugin
 from ..config import check, parse
@@ -10,10 +11,19 @@ from ..errors import ConfigError
 
 
 class System(plugin.BaseSystem):
-    """Base of all registered systems. parts: sections of Config that are free dicts, each with its dataclass; they are
-    in `self.part`, parsed, when `configure` returns."""
+    """Base of all registered systems. Parts: the sections of Config that are free dicts, each with its dataclass; they
+    are in `self.part`, parsed, when `configure` returns."""
 
-    parts: dict[str, type] = {}
+    @dataclass(frozen=True)
+    class Parts:
+        """None, so far."""
+
+    parts: dict[str, type] = {}  # the same by name, for config.check
+    part: Parts
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.parts = get_type_hints(cls.Parts)
 
     def __init__(self, cfg: Any, resumed: bool = False):
         # The host's own parser knows neither the nearest key nor what the free sections may hold.
@@ -28,7 +38,9 @@ class System(plugin.BaseSystem):
                 "system.gs_source=<its folder>/save/last.ply"
             )
         self.automatic_optimization = False
-        self.part = {name: parse(cls, getattr(self.cfg, name), f"system.{name}") for name, cls in self.parts.items()}
+        self.part = self.Parts(
+            **{name: parse(cls, getattr(self.cfg, name), f"system.{name}") for name, cls in self.parts.items()}
+        )
 
     def configure_callbacks(self) -> list:
         """No callbacks: the first thing that Lightning asks for in every process, before data or model are touched, and

@@ -14,39 +14,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..config import BelowOne, Between, Count, Fraction, NonNegative
+from .. import plugin
+from ..diffusion.noise import keyed_generator
 from ..errors import SceneError
 from ..render.api import Render
 from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
+from .density import DensifyConfig, Density, Moment
 
 STATISTICS = ("grad_sum", "grad_count", "max_radius")
 SPLIT_SHRINK = 1.6  # a split splat's two children have scales divided by this (3DGS: 0.8 * 2)
 RESET_OPACITY = 0.01  # opacities above it are brought down to it at a reset (3DGS)
-
-
-@dataclass(frozen=True)
-class DensifyConfig:
-    """When and how the number of splats changes. Steps count optimizer steps; lengths are fractions of the extent."""
-
-    every: Count = 100  # steps between two densifications; 0: never
-    start: Count = 500  # first step at which splats may be added
-    stop: Count = 15000  # no splat is added or removed from this step on
-    grad_threshold: NonNegative = 2e-4  # mean screen gradient per half image side (NDC), from which on one is densified
-    top_fraction: Fraction = 1.0  # of the splats with any gradient, the fraction (largest first) that may be densified
-    dense_size: NonNegative = 0.01  # splats up to this size are cloned, larger ones split in two
-    min_opacity: BelowOne = 0.005  # more transparent ones are removed
-    max_size: NonNegative = 0.1  # larger ones are removed; 0: never
-    max_radius: NonNegative = 0.0  # pixels: ones that were drawn larger since the last time are removed; 0: never
-    max_splats: Count = 1_000_000  # cap on editable ones (908 MiB at SH degree 3), largest gradients go first; frozen
-    # ones, which take a quarter of that each and never grow in number, do not count
-    reset_every: Count = 0  # steps between two opacity resets; 0: never
-    candidates: NonNegative = 0.0  # faint splats tried around the others each time, a fraction of the editable; 0: none
-    candidates_least: Count = 200  # but no fewer than these
-    candidates_until: Fraction = 0.7  # fraction of the run after which none is tried: a step must still judge them
-    candidate_reach: NonNegative = 0.03  # standard deviation of their distance from a parent, a fraction of the extent
-    candidate_opacity: Between = 0.05  # with which they begin: those that nothing asks for fade, and are removed
 
 
 @dataclass(frozen=True)
@@ -200,3 +179,34 @@ def reset_opacity(splats: Splats) -> None:
     for key, value in (splats.optimizer.state.get(logits, {}) if splats.optimizer else {}).items():
         if value.shape == logits.shape:
             splats.optimizer.state[logits][key] = torch.zeros_like(value)
+
+
+class Adaptive(Density):
+    """Adaptive density control with this file's functions, and opacity resets."""
+
+    states = STATISTICS
+    _cap_announced = False
+
+    def begin(self, splats: Splats) -> None:
+        splats.state.update(screen_statistics(splats))
+
+    def observe(self, splats: Splats, render: Render, loss_scale: float = 1.0) -> None:
+        observe(splats, render, loss_scale)
+
+    def after_step(self, splats: Splats, moment: Moment) -> None:
+        super().after_step(splats, moment)
+        every, step = self.config.reset_every, moment.step
+        if every and step < min(self.config.stop, moment.max_steps) and step % every == 0:
+            reset_opacity(splats)
+
+    def densify(self, splats: Splats, moment: Moment) -> None:
+        config, step = self.config, moment.step
+        generator = keyed_generator(moment.seed, "split", step)
+        explore = config.candidates > 0 and step <= config.candidates_until * moment.max_steps
+        report = densify(splats, config, moment.extent, generator, moment.generations, explore)
+        if report.held_back and not self._cap_announced:
+            self._cap_announced = True
+            plugin.warn(
+                f"densification at step {step}: {report.held_back:,} splats to be divided have no room beside "
+                f"{len(splats):,} editable ones; raise system.densify.max_splats ({config.max_splats:,})"
+            )

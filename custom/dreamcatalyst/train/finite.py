@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from .. import plugin
 from ..errors import NumericalError
-
-if TYPE_CHECKING:
-    from .system import SplatSystem
 
 
 def require_finite(stage: str, **tensors: Tensor) -> None:
@@ -31,41 +26,25 @@ def gradient_norms(parameters: Mapping[str, Tensor]) -> dict[str, float]:
     Raises NumericalError for a gradient that is not finite, and for one whose square is not: Adam's second moment
     would be infinite from then on, and the parameter stand still for good, without a word.
     """
-    given = {name: value.grad for name, value in parameters.items() if value.grad is not None and value.numel()}
+    gradients = {name: value.grad for name, value in parameters.items() if value.grad is not None and value.numel()}
     norms = {name: 0.0 for name, value in parameters.items() if value.numel()}
-    if given:
-        found = torch.stack(torch._foreach_norm(list(given.values()))).tolist()  # waits for the device once
-        norms |= dict(zip(given, found, strict=True))
+    if gradients:
+        lengths = torch.stack(torch._foreach_norm(list(gradients.values()))).tolist()  # waits for the device once
+        norms |= dict(zip(gradients, lengths, strict=True))
     for name, norm in norms.items():
         if norm != norm or norm == float("inf"):
-            require_finite("backward", **{f"the gradient of {name}": given[name]})
+            require_finite("backward", **{f"the gradient of {name}": gradients[name]})
             raise NumericalError(f"stage backward: the gradient of {name} is so large that its square is not finite")
     return norms
 
 
-def kept_copy(parameters: Mapping[str, Tensor]) -> list[Tensor]:
-    """What the parameters are now, for `give_back`."""
+def snapshot(parameters: Mapping[str, Tensor]) -> list[Tensor]:
+    """Copies of the parameters, for `restore`."""
     return [value.detach().clone() for value in parameters.values()]
 
 
 @torch.no_grad()
-def give_back(parameters: Mapping[str, Tensor], kept: list[Tensor]) -> None:
-    """Make the parameters what they were."""
-    for value, before in zip(parameters.values(), kept, strict=True):
+def restore(parameters: Mapping[str, Tensor], copies: list[Tensor]) -> None:
+    """Make the parameters what they were at a `snapshot`."""
+    for value, before in zip(parameters.values(), copies, strict=True):
         value.copy_(before)
-
-
-def leave_out(system: SplatSystem, error: NumericalError, batch: Mapping[str, Any], step: int) -> None:
-    """End the run with the place of what is not finite, or where `system.nonfinite` is skip, leave the step out and
-    count it. Nothing of the step has reached the splats. Raises NumericalError."""
-    views, timestep = ", ".join(system.capture.views[i].name for i in batch["index"]), system.timestep(step)
-    place = f"step {step}, {'' if timestep is None else f'timestep {timestep}, '}view {views}"
-    if system.cfg.nonfinite == "stop":
-        raise NumericalError(f"{place}: {error}. The splats are those of the step before.") from error
-    record = system.record
-    record.skipped, record.numbers = record.skipped + 1, {}
-    if record.skipped.bit_count() == 1:  # said at the first, the second, the fourth, the eighth ... time
-        plugin.warn(f"{place}: {error}. The step is left out, {record.skipped} so far.")
-    if system.true_global_step == step:  # a step without gradients changes nothing, and is counted
-        system.optimizers().zero_grad()
-        system.optimizers().step()

@@ -14,43 +14,36 @@ from ..config import Between, Count, Fraction, Range
 from ..errors import DataError
 from ..loss.image import photometric_loss
 from ..render.api import Render
+from ..report.clock import Clock
 from ..scene.create import from_mesh, from_points
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
+from .method import Method, MethodParts
 from .system import SplatSystem
 
 
-@plugin.register("dreamcatalyst-fit-system")
-class FitSystem(SplatSystem):
+class FitMethod(Method):
     """Fits splats to the training photographs; begins with the reconstruction's points, a mesh, or a PLY of splats."""
 
-    @dataclass
-    class Config(SplatSystem.Config):
-        mesh: str = ""  # a mesh or point cloud whose surface gives the first splats, instead of the capture's points
-        mesh_points: Annotated[int, Range("[1, 100000000]")] = 50_000  # splats sampled from the mesh
-        sh_degree: Annotated[int, Range("[0, 3]")] = 3  # highest degree of the colour's spherical harmonics
-        sh_every: Count = 1000  # steps after which the next degree is let in
-        ssim_weight: Fraction = 0.2  # of D-SSIM in the loss, the rest is L1
-        initial_opacity: Between = 0.1
-
-    def configure(self) -> None:
-        super().configure()
+    def __init__(self, cfg: Any, part: MethodParts, clock: Clock):
+        super().__init__(cfg, part, clock)
         self._renders: dict[int, Tensor] = {}
 
     def first_scene(self) -> Gaussians:
-        capture = self.data.open()
-        if not capture.has_photos and self.data.world is None:
+        cfg, data = self.cfg, self.context.data
+        capture = data.open()
+        if not capture.has_photos and data.world is None:
             raise DataError(f"{capture.source}: has cameras but no photographs, and a fit needs some.")
-        if self.cfg.gs_source:
+        if cfg.gs_source:
             return self.given_scene()
-        if self.cfg.mesh:
-            return from_mesh(self.cfg.mesh, self.cfg.mesh_points, self.cfg.seed, sh_degree=self.cfg.sh_degree)
+        if cfg.mesh:
+            return from_mesh(cfg.mesh, cfg.mesh_points, cfg.seed, sh_degree=cfg.sh_degree)
         if capture.points is None:
             raise DataError(
                 f"{capture.source}: there are no reconstructed points to begin with. "
                 "Give some: system.mesh=<point cloud or mesh>, or system.gs_source=<PLY of splats>."
             )
-        return from_points(*capture.points, sh_degree=self.cfg.sh_degree, initial_opacity=self.cfg.initial_opacity)
+        return from_points(*capture.points, sh_degree=cfg.sh_degree, initial_opacity=cfg.initial_opacity)
 
     def sh_degree_at(self, step: int, scene: Gaussians) -> int:
         """The degree that has been let in by `step`."""
@@ -72,9 +65,26 @@ class FitSystem(SplatSystem):
     @torch.no_grad()
     def photo(self, index: int) -> Tensor:
         """The photograph of one view, [H,W,3] in [0,1]; of a made world, its render."""
-        if self.data.world is None:
+        world = self.context.data.world
+        if world is None:
             return self.capture.image(index)
         if index not in self._renders:
-            scene = self.data.world.scene.to(self.root_device)
+            scene = world.scene.to(self.context.device)
             self._renders[index] = self.draw(scene, self.camera(index)).rgb[0].clamp(0, 1)
         return self._renders[index]
+
+
+@plugin.register("dreamcatalyst-fit-system")
+class FitSystem(SplatSystem):
+    """A fit in Lightning."""
+
+    Method = FitMethod
+
+    @dataclass
+    class Config(SplatSystem.Config):
+        mesh: str = ""  # a mesh or point cloud whose surface gives the first splats, instead of the capture's points
+        mesh_points: Annotated[int, Range("[1, 100000000]")] = 50_000  # splats sampled from the mesh
+        sh_degree: Annotated[int, Range("[0, 3]")] = 3  # highest degree of the colour's spherical harmonics
+        sh_every: Count = 1000  # steps after which the next degree is let in
+        ssim_weight: Fraction = 0.2  # of D-SSIM in the loss, the rest is L1
+        initial_opacity: Between = 0.1

@@ -62,12 +62,16 @@ class PriorSystem(System):
     one (unless a stage is ended by minutes).
     """
 
-    parts: dict[str, type] = {
-        "autoencoder": AutoencoderConfig,
-        "text": TextConfig,
-        "unet": UnetConfig,
-        "samples": SamplesConfig,
-    }
+    @dataclass(frozen=True)
+    class Parts:
+        """The parsed sections."""
+
+        autoencoder: AutoencoderConfig
+        text: TextConfig
+        unet: UnetConfig
+        samples: SamplesConfig
+
+    part: Parts
 
     @dataclass
     class Config(System.Config):
@@ -76,6 +80,10 @@ class PriorSystem(System):
         text: dict = field(default_factory=dict)
         unet: dict = field(default_factory=dict)
         samples: dict = field(default_factory=dict)
+
+    def of(self, stage: str) -> AutoencoderConfig | UnetConfig:
+        """The section of a stage."""
+        return getattr(self.part, stage)
 
     # --- setting up
 
@@ -94,10 +102,8 @@ class PriorSystem(System):
         data = self.data
         self.merges = learn_merges(data.pairs.instruction)
         self.tokens = len(vocabulary(self.merges))
-        make = self.part
-        self.networks = make_networks(
-            make["autoencoder"], make["text"], make["unet"], data.cfg.size, self.tokens, self.cfg.seed
-        )
+        part = self.part
+        self.networks = make_networks(part.autoencoder, part.text, part.unet, data.cfg.size, self.tokens, self.cfg.seed)
         self.ema = copy.deepcopy(self.networks).requires_grad_(False)
         self.register_buffer("latent_std", torch.ones(()))
         for network in (self.networks, self.ema):
@@ -112,7 +118,7 @@ class PriorSystem(System):
         return [
             torch.optim.AdamW(
                 self.trained(stage),
-                lr=self.part[stage].learning_rate,
+                lr=self.of(stage).learning_rate,
                 betas=(0.9, 0.99),
                 weight_decay=0.01,
             )
@@ -134,7 +140,7 @@ class PriorSystem(System):
     def training_step(self, batch: Mapping[str, int], batch_idx: int) -> None:
         started = time.perf_counter()
         stage, step = self.stage, batch["step"]
-        config, progress = self.part[stage], self.progress[stage]
+        config, progress = self.of(stage), self.progress[stage]
         done = progress.at(step, config)
         number = step - progress.first
         optimizer = self.optimizers()[list(STAGES).index(stage)]
@@ -161,7 +167,7 @@ class PriorSystem(System):
 
     def _autoencoder_gradients(self, number: int, done: float) -> float:
         """The loss of one step, its gradients left in the parameters."""
-        config: AutoencoderConfig = self.part["autoencoder"]
+        config: AutoencoderConfig = self.part.autoencoder
         side, size = config.crop, config.batch_size
         if done >= 1 - config.whole:
             side, size = self.data.cfg.size, max(1, round(size * (config.crop / self.data.cfg.size) ** 2))
@@ -180,7 +186,7 @@ class PriorSystem(System):
         On a CPU every thread takes its own rows of the batch all the way: threads that wait for each other once a step,
         and not within every operation, keep their speed where cores are shared.
         """
-        size = self.part["unet"].batch_size
+        size = self.part.unet.batch_size
         drawn = self._unet_inputs(self.data.batch(number, size), number)
         threads = min(torch.get_num_threads(), size) if self.device.type == "cpu" else 1
         if threads == 1:
@@ -218,7 +224,7 @@ class PriorSystem(System):
         the aim is the image itself. The null instruction then changes nothing, and guidance points from there.
         Timesteps are drawn in proportion to themselves: the noisier, the more of an edit is still to be found.
         """
-        config: UnetConfig = self.part["unet"]
+        config: UnetConfig = self.part.unet
         rng = np.random.default_rng((self.cfg.seed, number, 1))
         draw, noisiness = rng.random(len(index)), rng.random(len(index)) ** 0.5
         t = torch.from_numpy((TIMESTEPS * noisiness).astype(np.int64))
@@ -241,20 +247,20 @@ class PriorSystem(System):
         if not hasattr(self, "_tokenizer"):
             self._known, self._tokenizer = {}, self._make_tokenizer()
         if text not in self._known:
-            options = dict(padding="max_length", max_length=self.part["text"].tokens, truncation=True)
+            options = dict(padding="max_length", max_length=self.part.text.tokens, truncation=True)
             self._known[text] = self._tokenizer(text, return_tensors="pt", **options).input_ids[0]
         return self._known[text]
 
     def _make_tokenizer(self) -> Any:
         from transformers import CLIPTokenizer
 
-        folder = write_tokenizer(self.path("prior") / "tokenizer", self.merges, self.part["text"].tokens)
+        folder = write_tokenizer(self.path("prior") / "tokenizer", self.merges, self.part.text.tokens)
         return CLIPTokenizer.from_pretrained(folder)
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
-        step, stage, every = self.true_global_step, self.stage, self.part["samples"].every
-        over = self.progress[stage].at(step, self.part[stage]) >= 1
+        step, stage, every = self.true_global_step, self.stage, self.part.samples.every
+        over = self.progress[stage].at(step, self.of(stage)) >= 1
         if over or (every and step % every == 0):
             self.write_pictures(step)
         if over and stage == "autoencoder":
@@ -275,7 +281,7 @@ class PriorSystem(System):
 
     def progress_metrics(self) -> dict[str, Any]:
         stage = self.stage
-        share = self.progress[stage].at(self.true_global_step, self.part[stage])
+        share = self.progress[stage].at(self.true_global_step, self.of(stage))
         shown = {"stage": stage, "of it": f"{share:.0%}", "minutes": self.progress[stage].seconds / 60}
         return shown if self._loss is None else {**shown, "loss": self._loss}
 
@@ -287,7 +293,7 @@ class PriorSystem(System):
 
     def write_pictures(self, step: int) -> None:
         """Some held-out pairs: what the autoencoder makes of them or, in the second stage, the edits of the moment."""
-        index = self.data.held_out_spread(self.part["samples"].pictures)
+        index = self.data.held_out_spread(self.part.samples.pictures)
         if self.stage == "autoencoder":
             rows, decibel = reconstruction_rows(self.ema["vae"], self.data.pairs, index, self.device)
         else:
@@ -297,7 +303,7 @@ class PriorSystem(System):
         plugin.info(f"step {step}, {self.stage}: {decibel:.2f} dB on held-out pairs")
 
     def _judge(self, prior: InstructPix2Pix, index: Sequence[int]) -> dict[str, Any]:
-        return judge_pairs(prior, self.data.pairs, index, self.part["samples"], self.cfg.seed)
+        return judge_pairs(prior, self.data.pairs, index, self.part.samples, self.cfg.seed)
 
     def on_test_start(self) -> None:
         self._prior = self.prior()

@@ -7,19 +7,16 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from omegaconf import OmegaConf
 
 from ..files import write_text
-from ..report.chart import line_chart, picture_file
-from ..report.curve import Curve
-from ..report.machine import machine, versions
-from ..report.page import Page, Table
+from .chart import line_chart, picture_file
+from .curve import Curve
+from .machine import machine, versions
+from .metrics import METRICS
+from .page import Page, Table
+from .record import Record
+from .run import RunFacts
 from .scores import mean_scores
-
-if TYPE_CHECKING:
-    from .system import SplatSystem
 
 PICTURES = 4  # views on the page
 LABELS = {  # of the tiles, the best first, by score
@@ -36,10 +33,7 @@ LABELS = {  # of the tiles, the best first, by score
     "clip_similarity": "CLIP image similarity",
     "aesthetic": "aesthetic score",
 }
-CHARTS = (  # title, how its columns begin, logarithmic
-    ("PSNR at held-out views, dB", "psnr_", False),
-    ("SSIM at held-out views", "ssim_", False),
-    ("L1 at held-out views", "l1_", True),
+CHARTS = (  # those after the metrics': title, how its columns begin, logarithmic
     ("convergence: change of the pictures per second, L1", "change_per_second", True),
     ("the rule's residual: root mean square of its gradient", "residual", True),
     ("loss", "loss", True),
@@ -55,29 +49,30 @@ def plain(values: Mapping[str, float]) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def write_report(system: SplatSystem, scores: Mapping[int, Mapping[str, float]]) -> list[Path]:
+def write_report(run: RunFacts, record: Record, scores: Mapping[int, Mapping[str, float]]) -> list[Path]:
     """Write error.csv and error.svg (where there was training), index.html and summary.json; return their folder.
 
     The summary's "overhead" says what reports took: rows, this function, and the share of both in the whole.
     """
-    began, folder, record = time.perf_counter(), system.report_dir, system.record
+    began, folder = time.perf_counter(), run.report
     mean, seconds = mean_scores(list(scores.values())), record.clock.seconds
     if record.curve.rows:
         record.curve.write_csv(folder / "error.csv")
-        plots = [chart for start, chart in charts(record.curve).items() if start in ("psnr_", "ssim_", "l1_")]
+        errors = [f"{measure.name}_" for measure in METRICS.parts()]
+        plots = [chart for start, chart in charts(record.curve).items() if start in errors]
         write_text(folder / "error.svg", picture_file(plots))
     summary = {
-        "step": system.true_global_step,
+        "step": run.step,
         "seconds": round(seconds, 2),
-        "splats": system.splats.total,
+        "splats": run.splats,
         "skipped": record.skipped,
-        "held_out": [system.capture.views[i].name for i in scores],
+        "held_out": [run.capture.views[i].name for i in scores],
         "mean": plain(mean),
         "stages": {name: round(value, 3) for name, value in record.clock.stages.items()},
-        "machine": machine(system.root_device),
+        "machine": machine(run.device),
         "versions": versions(),
     }
-    make_page(system, summary, scores).write(folder / "index.html")
+    make_page(run, record, summary, scores).write(folder / "index.html")
     rows, files = record.clock.reporting, time.perf_counter() - began
     share = (rows + files) / (seconds + rows + files)
     summary["overhead"] = {"rows": round(rows, 3), "files": round(files, 3), "share": round(share, 4)}
@@ -89,9 +84,11 @@ def charts(curve: Curve) -> dict[str, str]:
     """What the rows tell against seconds, by how the columns begin. Of an edit that is confined, errors where it is and
     where it is not."""
     confined, drawn = any(c.endswith("_inside") for c in curve.columns), {}
-    for title, start, log in CHARTS:
+    errors = [(m, f"{m.name}_") for m in METRICS.parts()]
+    titles = [(m.label(f"{m.title} at held-out views"), start, m.better == "lower") for m, start in errors]
+    for title, start, log in (*titles, *CHARTS):
         columns = [c for c in curve.columns if c.startswith(start) and (start.endswith("_") or c == start)]
-        if confined and start in ("psnr_", "ssim_", "l1_"):
+        if confined and start in [start for _, start in errors]:
             columns = [c for c in columns if c.endswith(("_inside", "_outside"))]
         if columns == ["splats"] and len({row["splats"] for row in curve.rows}) == 1:
             continue
@@ -122,39 +119,37 @@ def unmeasured(columns: Iterable[str]) -> str:
     )
 
 
-def make_page(system: SplatSystem, summary: Mapping, scores: Mapping[int, Mapping[str, float]]) -> Page:
+def tile_labels(mean: Mapping[str, float]) -> dict[str, str]:
+    """The scores that are shown large, by name: those of LABELS, of PSNR only the first, and of each other metric that
+    is registered its first column."""
+    best = next((name for name in LABELS if name in mean), None)
+    labels = {name: label for name, label in LABELS.items() if name in mean and (name == best or name[:5] != "psnr_")}
+    for measure in METRICS.parts():
+        if not any(name.startswith(f"{measure.name}_") for name in LABELS):
+            first = [name for name in mean if name.startswith(f"{measure.name}_")][:1]
+            labels |= {name: measure.label(name.replace("_", " ")) for name in first}
+    return labels
+
+
+def make_page(run: RunFacts, record: Record, summary: Mapping, scores: Mapping[int, Mapping[str, float]]) -> Page:
     """The page of a run."""
-    mean, views, folder = mean_scores(list(scores.values())), system.capture.views, system.report_dir.parent
-    best = next((name for name in LABELS if name in mean), None)  # the first of several is the one that counts
-    tiles = {
-        label: f"{mean[name]:.4g}"
-        for name, label in LABELS.items()
-        if name in mean and (name == best or name[:5] != "psnr_")
-    }
+    mean, views, folder = mean_scores(list(scores.values())), run.capture.views, run.folder
+    tiles = {label: f"{mean[name]:.4g}" for name, label in tile_labels(mean).items()}
     tiles |= {"steps": f"{summary['step']:,}", "seconds in training": f"{summary['seconds']:,.1f}"}
-    tiles |= {"splats": f"{summary['splats']:,}"} | (
-        {"steps left out": f"{system.record.skipped}"} if system.record.skipped else {}
-    )
+    tiles |= {"splats": f"{summary['splats']:,}"} | ({"steps left out": f"{record.skipped}"} if record.skipped else {})
     shown = list(scores)[:: max(1, len(scores) // PICTURES)][:PICTURES]
     given = {
         name: "\n".join(f"{key}: {value}" for key, value in summary[name].items()) for name in ("machine", "versions")
     }
-    plan = system.report_dir / "plan.json"
-    texts = {"The plan": system.plan_text} if plan.is_file() and system.plan_text else {}
+    texts = {"The plan": run.plan} if run.plan and (run.report / "plan.json").is_file() else {}
     return Page(
-        title=system.title,
-        subtitle=f"{folder.parent.name}/{folder.name} · {system.capture.source} · {summary['machine']['processor']}",
+        title=run.title,
+        subtitle=f"{folder.parent.name}/{folder.name} · {run.capture.source} · {summary['machine']['processor']}",
         tiles=tiles,
-        pictures=[system.panels(index) for index in shown],
-        charts=list(charts(system.record.curve).values()),
+        pictures=[run.panels(index) for index in shown],
+        charts=list(charts(record.curve).values()),
         stages=summary["stages"],
         tables={"Scores": score_rows([views[i].name for i in scores], list(scores.values()))} if scores else {},
-        notice=unmeasured([*mean, *system.record.curve.columns]),
-        texts={**texts, "Config": config_text(system), "Machine": given["machine"], "Versions": given["versions"]},
+        notice=unmeasured([*mean, *record.curve.columns]),
+        texts={**texts, "Config": run.config_text, "Machine": given["machine"], "Versions": given["versions"]},
     )
-
-
-def config_text(system: SplatSystem) -> str:
-    """What made the run: the whole config where the launcher left it beside the report, else the system's own."""
-    whole = system.report_dir.parent / "configs" / "parsed.yaml"
-    return whole.read_text(encoding="utf-8") if whole.is_file() else OmegaConf.to_yaml(system.cfg)

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..report.clock import LOGGING, OTHER, Clock
-from ..report.curve import Curve
-from ..report.machine import peak_memory, waiter
-from .results import ReportConfig
+from .clock import LOGGING, OTHER, Clock
+from .curve import Curve
+from .machine import peak_memory, waiter
+from .run import ReportConfig, RunFacts
 from .scores import mean_scores
-
-if TYPE_CHECKING:
-    from .system import SplatSystem
 
 
 class Record:
@@ -31,37 +28,41 @@ class Record:
         self._cost, self._measured = 0.0, 0  # seconds and step of the latest measurement
         self._seen: tuple[float, dict[int, Tensor]] | None = None  # the seconds and the pictures of it
 
-    def begin(self, system: SplatSystem) -> None:
-        """Start the clock, and of a new run, add the row of step 0."""
-        system.picture(self.views(system)[0])  # the first picture may compile the renderer: no part of any run
-        self.clock.wait = waiter(system.root_device)
+    def begin(self, run: RunFacts, last: int) -> None:
+        """Start the clock, and of a new run, add the row of step 0. last: step at which the run ends."""
+        run.picture(self.views(run)[0])  # the first picture may compile the renderer: no part of any run
+        self.clock.wait = waiter(run.device)
         self.clock.start()
-        if system.true_global_step == 0:
-            self.add(system, 0)
+        if run.step == 0:
+            self.add(run, last)
 
-    def views(self, system: SplatSystem) -> list[int]:
+    def views(self, run: RunFacts) -> Sequence[int]:
         """The held-out views that are measured along the way."""
-        held_out, count = system.data.held_out, self.config.views
-        return held_out[:: max(1, len(held_out) // count)][:count]
+        return run.held_out[:: max(1, len(run.held_out) // self.config.views)][: self.config.views]
 
     def wanted(self, step: int, last: int) -> bool:
         """Whether `step` has a row."""
         return step >= last or bool(self.config.every and step % self.config.every == 0)
 
-    def add(self, system: SplatSystem, step: int) -> None:
-        """Add the row of `step`; it takes the place of an earlier one of the same step."""
-        clock = self.clock
+    def skip(self) -> int:
+        """Count a step that was left out, and forget its numbers; returns how many there are."""
+        self.skipped, self.numbers = self.skipped + 1, {}
+        return self.skipped
+
+    def add(self, run: RunFacts, last: int) -> None:
+        """Add the row of this step; it takes the place of an earlier one of the same step. last: as in `begin`."""
+        clock, step = self.clock, run.step
         with clock.stage(LOGGING):
-            row = {"step": step, "seconds": round(clock.seconds, 3), "splats": system.splats.total}
+            row = {"step": step, "seconds": round(clock.seconds, 3), "splats": run.splats}
             row |= {f"seconds_{name}": round(value, 6) for name, value in clock.stages.items()}
-            memory = peak_memory(system.root_device)
+            memory = peak_memory(run.device)
             row |= {} if memory is None else {"memory_mib": round(memory, 1)}
             row |= {"skipped": self.skipped} if self.skipped else {}
-            measured = self._due(step, system.max_steps)
-            self.curve.add(**row, **self.numbers, **(self._errors(system) if measured else {}))
+            measured = self._due(step, last)
+            self.curve.add(**row, **self.numbers, **(self._errors(run) if measured else {}))
             if measured:
                 self._measured = step
-                self.curve.write_csv(system.report_dir / "error.csv")
+                self.curve.write_csv(run.report / "error.csv")
 
     def _due(self, step: int, last: int) -> bool:
         """Whether the errors of this row are measured: so that the rows that can still be paid for, if the run goes on
@@ -72,13 +73,14 @@ class Record:
         rows = (budget - self.clock.reporting) / max(self._cost, 1e-6) - 1  # the last one is put by
         return rows >= 1 and (step - self._measured) * rows >= last - step
 
-    def _errors(self, system: SplatSystem) -> dict[str, float]:
+    def _errors(self, run: RunFacts) -> dict[str, float]:
         """Scores at the views of `views`, mean over them, and how fast the pictures change."""
-        for index in self.views(system):  # made once, and no part of what the next row will take
-            system.references(index)
+        views = self.views(run)
+        for index in views:  # drawn once, and no part of what the next row will take
+            run.references(index)
         began = time.perf_counter()
-        pictures = {index: system.picture(index) for index in self.views(system)}
-        errors = mean_scores([system.score(index, picture, brief=True) for index, picture in pictures.items()])
+        pictures = {index: run.picture(index) for index in views}
+        errors = mean_scores([run.score(index, picture, brief=True) for index, picture in pictures.items()])
         if self._seen is not None and self.clock.seconds > self._seen[0]:
             then, before = self._seen
             moved = torch.stack([(pictures[index] - before[index]).abs().mean() for index in pictures]).mean()

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from ..data.views import Capture
-from ..report.consistency import disagreement, nearest_views
-
-if TYPE_CHECKING:
-    from .system import SplatSystem
+from .consistency import disagreement, nearest_views
+from .run import RunFacts
 
 
 def mean_scores(scores: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -43,31 +40,27 @@ def print_scores(scores: Mapping[int, Mapping[str, float]], capture: Capture) ->
     print(f"held-out views ({len(scores)}):\n{score_table(scores, capture)}", flush=True)
 
 
-def log_scores(system: SplatSystem, scores: Mapping[int, Mapping[str, float]], stage: str) -> None:
-    """Hand the mean scores to Lightning's loggers."""
-    system.log_dict({f"{stage}/{name}": value for name, value in mean_scores(list(scores.values())).items()})
-
-
 @torch.no_grad()
-def last_scores(system: SplatSystem, views: Sequence[int]) -> dict[int, dict[str, float]]:
+def last_scores(run: RunFacts, views: Sequence[int]) -> dict[int, dict[str, float]]:
     """Scores that are taken once, at the end: consistency with the view that is nearest ("short") and 7th nearest
-    ("long"), of the splats and of `known_scenes`, and CLIP's."""
+    ("long"), of the splats and of the other scenes, and CLIP's."""
     scores: dict[int, dict[str, float]] = {index: {} for index in views}
-    everything = system.capture.poses(range(len(system.capture)))
-    for name, scene in {"": system.splats.scene.detach(), **system.known_scenes()}.items():
+    capture = run.capture
+    everything = capture.poses(range(len(capture)))
+    for name, scene in run.scenes().items():
         renders = {}
         for index in views:
             others = nearest_views(everything, index, (1, 7))
             for view in (index, *others):
                 if view not in renders:
-                    renders[view] = system.draw(scene, system.camera(view), depth=True)
+                    renders[view] = run.draw(scene, capture.cameras([view]), depth=True)
             for reach, other in zip(("short", "long"), others, strict=False):
-                pair = renders[index], system.camera(index), renders[other], system.camera(other)
+                pair = renders[index], capture.cameras([index]), renders[other], capture.cameras([other])
                 if (value := disagreement(*pair)) is not None:
                     scores[index]["_".join(filter(None, ("consistency", reach, name)))] = value
-    if system.judge is not None:
+    if run.judge is not None:
         for index in views:
-            source = system.references(index).get("source")
+            source = run.references(index).get("source")
             if source is not None:
-                scores[index] |= system.judge(source[None], system.picture(index)[None])[0]
+                scores[index] |= run.judge(source[None], run.picture(index)[None])[0]
     return scores
