@@ -108,11 +108,13 @@ def link_into(host: Path) -> int:
 def run(args: argparse.Namespace, overrides: list[str], stop: Any) -> int:
     """Load the config, build data and system, and hand them to Lightning. stop: the Stop that takes the signals."""
     from dreamcatalyst.config import merge_config, read_config
+    from dreamcatalyst.imports import import_parts
 
     if args.gpu is not None:
         os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(args.gpu))  # read by torch, which is not imported yet
     merged = merge_config(args.config, cli_args=overrides)
     config = read_config(merged, lambda: keys_below(merged))
+    import_parts(config.imports)
     mode = args.mode or "train"
 
     from dreamcatalyst.runs import claimed, told

@@ -331,6 +331,7 @@ class ExperimentConfig:
     trial_name: str = ""
     trial_dir: str = ""
     n_gpus: Count = 1
+    imports: tuple[str, ...] = ()  # Python files or modules that register parts of one's own, before anything is built
     resume: str | None = None  # a checkpoint to go on from, in the trial where it lies
     data_type: str = ""
     data: dict = field(default_factory=dict)

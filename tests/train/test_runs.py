@@ -9,9 +9,9 @@ import pytest
 import torch
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.errors import ConfigError
+from dreamcatalyst.report import results
 from dreamcatalyst.scene.fitted import Fitted
 from dreamcatalyst.scene.ply import read_ply, write_ply
-from dreamcatalyst.report import results
 from dreamcatalyst.train.editing import PromptConfig
 from dreamcatalyst.train.fit import FitMethod
 from dreamcatalyst.train.optim import LearningRates
