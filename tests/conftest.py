@@ -7,6 +7,7 @@ import resource
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # read by torch when it is
 os.environ.setdefault("NUMBA_NUM_THREADS", str(max(2, THREADS)))  # two: tests show that their number changes no bit
 
 import torch  # noqa: E402
+
+ROOT = Path(__file__).resolve().parent.parent
+SMALL = ["data.width=24", "data.height=24", "system.report.video_frames=0", "trainer.accelerator=cpu"]
 
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever started the tests may have had it ignored (nohup)
 
@@ -82,3 +86,23 @@ def gsplat_here(monkeypatch):
     from tests.render.gsplat_on_cpu import install
 
     install(monkeypatch)
+
+
+@pytest.fixture
+def launch(tmp_path, monkeypatch):
+    """Run the launcher in this process on a small statue; returns the trial's folder."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    import launch as launcher
+
+    def run(config: str, *overrides: str, mode: str = "--train", name: str = "run", status: int = 0) -> Path:
+        """A run that does not resume has a folder of its own: name, or where there is one of it, name-2, name-3, ..."""
+        taken = sum(f.name == name or f.name.startswith(f"{name}-") for f in tmp_path.iterdir())
+        if taken and not any(o.startswith("resume=") for o in overrides):
+            name = f"{name}-{taken + 1}"
+        arguments = ["--config", str(ROOT / "configs" / config), mode, "data.source=demo:statue", *SMALL]
+        arguments += [f"exp_root_dir={tmp_path}", f"name={name}", "tag=trial", "use_timestamp=false", *overrides]
+        monkeypatch.setattr(sys, "argv", ["launch.py", *arguments])
+        assert launcher.main(arguments) == status
+        return tmp_path / name / "trial"
+
+    return run

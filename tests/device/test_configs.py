@@ -21,7 +21,6 @@ from dreamcatalyst.train.source import SourceViews
 import launch as launcher
 from tests.device.far import DeviceError, Far, install
 from tests.test_configs import CONFIGS, ROOT, models, overrides  # noqa: F401  (models is a fixture)
-from tests.train.conftest import launch  # noqa: F401  (a fixture)
 from tests.train.test_confined import ANCHORED, GROWING, MASK
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -127,7 +126,7 @@ def test_a_mistake_in_the_product_is_seen(device, run, monkeypatch, plant):
         run("configs/dc-splat.yaml")
 
 
-def test_statistics_on_the_cpu_are_seen(device, launch, few, monkeypatch):  # noqa: F811
+def test_statistics_on_the_cpu_are_seen(device, launch, few, monkeypatch):
     monkeypatch.setattr(
         "dreamcatalyst.train.densify.screen_statistics",
         lambda splats: {name: torch.zeros(len(splats)) for name in densify.STATISTICS},
