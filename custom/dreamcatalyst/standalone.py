@@ -51,10 +51,10 @@ class BaseObject:
 
 
 class BaseSystem(LightningModule):
-    """A LightningModule with a config, a save folder, and update hooks before and after every batch.
+    """A LightningModule with a config and a save folder.
 
-    Order: configure, post_configure | set_save_dir | Lightning's hooks. Subclasses define
-    configure, training_step and so on, and may define update_step(epoch, step), called before each batch.
+    Order: configure, post_configure | set_save_dir | Lightning's hooks. The host's update hooks (preprocess_data,
+    update_step) are left out: no system of ours has any.
     """
 
     @dataclass
@@ -154,41 +154,7 @@ class BaseSystem(LightningModule):
         have been tried then."""
         try_each(self.savers())
 
-    # --- updates: before every batch of whatever stage, and after every training batch
-
-    def preprocess_data(self, batch: Any, stage: str) -> None:
-        """A look at the batch before its step; stage is train, validation, test or predict."""
-
-    def update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        """A function of epoch and step only: the host may call it several times per step."""
-
-    def update_step_end(self, epoch: int, global_step: int) -> None:
-        """After a training batch."""
-
-    def do_update_step(self, epoch: int, global_step: int, on_load_weights: bool = False) -> None:
-        self.update_step(epoch, global_step, on_load_weights=on_load_weights)
-
-    def do_update_step_end(self, epoch: int, global_step: int) -> None:
-        self.update_step_end(epoch, global_step)
-
-    def _before_batch(self, batch: Any, stage: str) -> None:
-        self.preprocess_data(batch, stage)
-        self.do_update_step(self.true_current_epoch, self.true_global_step)
-
-    def on_train_batch_start(self, batch: Any, batch_idx: int, unused: int = 0) -> None:
-        self._before_batch(batch, "train")
-
-    def on_validation_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
-        self._before_batch(batch, "validation")
-
-    def on_test_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
-        self._before_batch(batch, "test")
-
-    def on_predict_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
-        self._before_batch(batch, "predict")
-
-    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        self.do_update_step_end(self.true_current_epoch, self.true_global_step)
+    # --- after a batch
 
     def on_validation_batch_end(self, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
         if self.cfg.cleanup_after_validation_step:

@@ -12,7 +12,7 @@ from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.report import results
 from dreamcatalyst.scene.fitted import Fitted
 from dreamcatalyst.scene.ply import read_ply, write_ply
-from dreamcatalyst.train.editing import PromptConfig
+from dreamcatalyst.train.edit_config import PromptConfig
 from dreamcatalyst.train.fit import FitMethod
 from dreamcatalyst.train.optim import LearningRates
 

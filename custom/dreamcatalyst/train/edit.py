@@ -8,7 +8,8 @@ from typing import Any
 
 from .. import plugin
 from ..config import Count
-from .editing import EditMethod, EditParts
+from .edit_config import EditParts
+from .editing import EditMethod
 from .system import SplatSystem
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,11 @@ from torch import Tensor
 
 from .. import plugin
 from ..cache import ByteCache
-from ..config import Count, Fraction, NonNegative
 from ..data.camera import Cameras
 from ..demo.edits import normalised
 from ..errors import ConfigError, SceneError, choose
-from ..guidance.guidance import Guidance, GuidanceConfig, chosen_prior
-from ..loss.anchor import AnchorConfig, anchor_loss, anchor_step
+from ..guidance.guidance import Guidance, chosen_prior
+from ..loss.anchor import anchor_loss, anchor_step
 from ..loss.perceptual import Lpips
 from ..render.api import Render
 from ..report.metrics import psnr
@@ -29,71 +27,17 @@ from ..scene.edit import Splats
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from ..scene.ply import read_splats, write_ply
-from ..segment.api import MaskConfig, MaskRequest
-from .density import DensifyConfig
+from ..segment.api import MaskRequest
+from .edit_config import EditParts
 from .finite import require_finite
-from .method import Method, MethodParts
+from .method import Method
 from .plan import PlanBuilder, scene_bytes
-from .preview import PreviewConfig, preview_sheet
+from .preview import preview_sheet
 from .region import EditRegion, dilate, restrict_to_mask
 from .source import SourceViews
 from .truth import Truth, find_truth
 
-REGIONS = ("current", "start", "everywhere")
 PHOTO_WARNING_DB = 15.0  # below it a source render and its photograph have hardly anything in common
-
-
-@dataclass(frozen=True)
-class PromptConfig:
-    """What is wanted, in words."""
-
-    prompt: str = ""  # the instruction (a description where the prior is a text-to-image model)
-    source_prompt: str = ""  # a description of the source, for rules that compare with it (dds, pds)
-
-    def __post_init__(self) -> None:
-        if not self.prompt.strip():
-            raise ConfigError('prompt: is empty. Say what is wanted, e.g. prompt="Make it sunset".')
-
-
-@dataclass(frozen=True)
-class LossConfig:
-    """What is minimised, as a sum of terms; the anchors' weights stand in `anchor`."""
-
-    lambda_guidance: NonNegative = 1.0  # of the rule's loss (GaussianEditor's lambda_l1 = 10 for pictures)
-    region: str = "current"  # what a mask lets change of an image: current | start | everywhere (as published)
-    reach: Fraction = 0.06  # so far beyond the editable splats of the moment, a fraction of the longer side
-    lambda_outside: NonNegative = 3.0  # of L1 to the source where no editable splat is seen
-    lambda_perceptual: NonNegative = 0.0  # of LPIPS, for rules that deliver a picture (GaussianEditor's lambda_p = 10)
-    perceptual_weights: str = ""  # a folder with VGG-16's and LPIPS's weight files (loss/perceptual.py)
-
-    def __post_init__(self) -> None:
-        choose("region", self.region, REGIONS, "region")
-        if self.lambda_perceptual and not self.perceptual_weights:
-            raise ConfigError(
-                "perceptual_weights: is empty. LPIPS needs the folder that holds its two weight files; or set "
-                "lambda_perceptual=0"
-            )
-
-
-@dataclass(frozen=True)
-class EditDensifyConfig(DensifyConfig):
-    """Density control of an edit: the source has large splats of its own, a sky for one, which are no mistake."""
-
-    max_size: NonNegative = 0.0
-    max_splats: Count = 5_000_000  # a scene of one's own may have millions to begin with; an edit adds few to them
-
-
-@dataclass(frozen=True)
-class EditParts(MethodParts):
-    """The parsed sections of an edit."""
-
-    guidance: GuidanceConfig
-    prompt_processor: PromptConfig
-    preview: PreviewConfig
-    mask: MaskConfig
-    densify: EditDensifyConfig
-    anchor: AnchorConfig
-    loss: LossConfig
 
 
 def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> None:
