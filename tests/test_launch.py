@@ -17,6 +17,7 @@ from dreamcatalyst import plugin
 from dreamcatalyst.config import Scalar
 
 import launch
+from tests import processes
 
 ROOT = Path(launch.__file__).parent
 
@@ -202,12 +203,12 @@ def test_the_progress_line_shows_step_metrics_pace_and_time_left(toy, capsys):
 def test_lightnings_own_talk_is_left_out_unless_asked_for(toy):
     # In a process of its own, where Lightning is imported by the launch and sets up its loggers.
     code = "import sys; sys.path[:0] = ['.', 'custom', 'tests']; import launch, test_launch; launch.main(sys.argv[1:])"
-    command = [sys.executable, "-c", code, "--config", str(toy)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    command = ["-c", code, "--config", str(toy)]
+    done = subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=True)
     assert [line.split()[0] for line in done.stderr.splitlines()] == ["train:", "train", "test"]
     assert done.stdout == ""
-    done = subprocess.run([*command, "--verbose"], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert "GPU available" in done.stderr
+    done = processes.python([*command, "--verbose"], ROOT)
+    assert done.returncode == 0 and "GPU available" in done.stderr
 
 
 @pytest.mark.parametrize(

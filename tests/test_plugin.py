@@ -16,14 +16,18 @@ from dreamcatalyst.scene.ply import write_ply
 from omegaconf import OmegaConf
 
 import launch
+from tests import processes
 
 ROOT = Path(__file__).resolve().parent.parent
 STEPS = 2
 
 
-def python(code: str, folder: Path = ROOT) -> str:
-    """What `code` prints in a process of its own, run in `folder`."""
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
+def python(code: str, folder: Path = ROOT, bare: bool = False) -> str:
+    """What `code` prints in a process of its own, run in `folder`. bare: in which no library is imported yet."""
+    if bare:
+        done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
+    else:
+        done = processes.python(["-c", code], folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
 
@@ -35,7 +39,8 @@ def test_registering_alone_imports_nothing_heavy():
     python(
         "import sys; sys.path.insert(0, 'custom'); import dreamcatalyst\n"
         "heavy = {'torch', 'lightning', 'numba', 'diffusers', 'transformers', 'pycolmap', 'cv2', 'omegaconf'}\n"
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)",
+        bare=True,
     )
 
 
@@ -118,7 +123,7 @@ def new_host(folder: Path) -> Path:
 
 
 def link(host: Path) -> None:
-    subprocess.run([sys.executable, "launch.py", "--link", str(host)], cwd=ROOT, check=True)
+    assert launch.main(["--link", str(host)]) == 0
 
 
 def clone(host: Path, name: str) -> Path:
@@ -156,6 +161,7 @@ def test_the_host_finds_every_name_beside_an_extension_that_fails(host):
         "heavy &= set(sys.modules) - before\n"
         "assert not heavy, heavy\n",
         host,
+        bare=True,
     )
     assert "custom: dreamcatalyst\n" in told and "custom: broken (IMPORT FAILED)" in told
 
@@ -248,9 +254,11 @@ atexit.register(lambda: print("opened", sum(name.endswith("given.ply") for name 
 """
 
 
-def in_host(host: Path, *arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "launch.py", "--config", "configs/dreamcatalyst/closed-form.yaml", *arguments]
-    return subprocess.run(command, cwd=host, capture_output=True, text=True)
+def in_host(host: Path, *arguments: str, bare: bool = False) -> subprocess.CompletedProcess:
+    command = ["launch.py", "--config", "configs/dreamcatalyst/closed-form.yaml", *arguments]
+    if bare:
+        return subprocess.run([sys.executable, *command], cwd=host, capture_output=True, text=True)
+    return processes.python(command, host)
 
 
 def test_the_edit_runs_in_the_host_and_is_validated_and_exported_from_its_checkpoint(host):
@@ -263,7 +271,7 @@ def test_the_edit_runs_in_the_host_and_is_validated_and_exported_from_its_checkp
     short = [f"trainer.max_steps={STEPS}", f"checkpoint.every_n_train_steps={STEPS}", "name=seam", "tag=edit"]
     short += ["data.width=64", "data.height=64", "system.report.every=0", "system.report.video_frames=4"]
     short += ["data.source=null", "system.gs_source=given.ply"]
-    done = in_host(host, "--train", *short)
+    done = in_host(host, "--train", *short, bare=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
     assert "opened 3 times" in done.stdout  # where it lies, how it was fitted, and then the splats
     (trial,) = (host / "outputs/seam").iterdir()

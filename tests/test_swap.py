@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
+import launch
+from tests import processes
 from tests.diffusion.small_model import make_model
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -22,16 +23,16 @@ def host(tmp_path_factory):
     folder = tmp_path_factory.mktemp("swap") / "threestudio"
     shutil.copytree(ROOT / "tests/host", folder, ignore=shutil.ignore_patterns("__pycache__"))
     (folder / "custom").mkdir()
-    subprocess.run([sys.executable, "launch.py", "--link", str(folder)], cwd=ROOT, check=True)
+    assert launch.main(["--link", str(folder)]) == 0
     make_model(folder / "ip2p")
     make_model(folder / "sd", channels=4)
     return folder
 
 
 def run(host: Path, config: str, *arguments: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "launch.py", "--train", "--config", config, *arguments]
+    command = ["launch.py", "--train", "--config", config, *arguments]
     short = ["trainer.max_steps=2", "trainer.precision=32", "checkpoint.every_n_train_steps=2", "name=swap", "tag=t"]
-    return subprocess.run([*command, *short], cwd=host, capture_output=True, text=True)
+    return processes.python([*command, *short], host)
 
 
 def losses(done: subprocess.CompletedProcess) -> list[float]:
