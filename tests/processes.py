@@ -46,12 +46,13 @@ def _serve() -> None:
         job = json.loads(line)
         child = os.fork()
         if child == 0:
-            return _run(**job)
+            _run(**job)
+            return
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 
 
 def _run(arguments: list[str], folder: str, files: list[str]) -> None:
-    for number, file in zip((1, 2), files):
+    for number, file in enumerate(files, start=1):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), number)
     sys.stdin = open(os.devnull)  # noqa: SIM115, PTH123
     os.chdir(folder)
