@@ -26,7 +26,9 @@ import torch  # noqa: E402
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = ["data.width=24", "data.height=24", "system.report.video_frames=0", "trainer.accelerator=cpu"]
 
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever started the tests may have had it ignored (nohup)
+for _number, _handler in ((signal.SIGHUP, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
+    if signal.getsignal(_number) is signal.SIG_IGN:  # whoever started the tests had it ignored (nohup, &)
+        signal.signal(_number, _handler)
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -31,8 +31,12 @@ def part_color(world, name, part):
 
 
 def test_the_worlds_have_every_target(worlds):
-    targets = {edit.target for edit in EDITS.values() if edit.target}
-    assert targets <= {thing.name for seed in range(30) for thing in random_world(seed, views=1).things}
+    missing = {edit.target for edit in EDITS.values() if edit.target}
+    for seed in range(30):
+        missing -= {thing.name for thing in random_world(seed, views=1).things}
+        if not missing:
+            break
+    assert not missing
 
 
 @pytest.mark.parametrize("index", range(5))
