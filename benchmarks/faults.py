@@ -5,7 +5,7 @@ there is lost, if an error is due and none comes, if the line does not name what
 Almost all run in this process; kills, signals and full disks in processes of their own. Takes a few minutes; the exit
 status is 1 if one fails.
 
-python benchmarks/faults.py [--only words ...] [--write docs/faults.md]
+python benchmarks/faults.py [--only words ...] [--write faults.md]
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SHOWN = 240  # characters of a message in the table
 INTRODUCTION = """# Bad input and faults
 
 What was given, what came of it, the exit status, and what was left on disk. Written by `python benchmarks/faults.py
---write docs/faults.md`, which runs all cases (`benchmarks/faulty/`) and fails where there is a traceback, where
+--write faults.md`, which runs all cases (`benchmarks/faulty/`) and fails where there is a traceback, where
 something is lost, where an error is due and none comes, where the message does not name what is to blame, or where it
 comes late. `--only resume` runs the cases whose group or name holds the word.
 

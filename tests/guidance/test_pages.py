@@ -15,6 +15,7 @@ from dreamcatalyst.guidance.timesteps import POLICIES, Schedule
 from dreamcatalyst.render.api import BACKENDS
 from dreamcatalyst.scene.generations import ANCHORS
 from dreamcatalyst.segment.api import SEGMENTERS
+from dreamcatalyst.train.density import DENSITY
 
 ROOT = Path(__file__).resolve().parents[2]
 GRADIENT_RULES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
@@ -79,10 +80,10 @@ def test_where_the_sampler_converges_at_equal_spreads():
         assert all(0.0 <= contraction(prior, get_rule("dds"), t, *scales) < 1.0 for t in range(1000))
 
 
-def test_the_readme_lists_every_choice():
+def test_the_page_of_choices_lists_every_one():
     """Of the keys whose choices are registered: no more and no fewer."""
     rows = re.findall(
-        r"^\| `(system\.\S+)` \| (.*) \|$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE
+        r"^\| `(system\.\S+)` \| (.*) \|$", (ROOT / "docs/choose.md").read_text(encoding="utf-8"), re.MULTILINE
     )
     told = {key: set(re.findall(r"`([^`]+)`", choices)) for key, choices in rows}
     told["system.guidance.rule"] = {
@@ -95,6 +96,7 @@ def test_the_readme_lists_every_choice():
         "system.guidance.noise": set(NOISES),
         "system.mask.kind": {"none", *SEGMENTERS.names()},
         "system.anchor.kind": {"none", *ANCHORS},
+        "system.densify.strategy": set(DENSITY.names()),
         "system.renderer.backend": {"auto", *BACKENDS.names()},
     }
 

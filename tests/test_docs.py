@@ -1,0 +1,138 @@
+"""The documentation: its commands run as printed, its links lead somewhere, and the README stays a front door."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from benchmarks.tutorial import PICTURE, Block, blocks, run, script
+
+ROOT = Path(__file__).resolve().parent.parent
+FRONT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+PAGES = FRONT + sorted((ROOT / "docs").glob("*.md"))
+HOSTS = {"configs/dreamfusion-sd.yaml", "configs/instructnerf2nerf.yaml"}  # threestudio's own
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+SHORT = "trainer.max_steps=8 system.report.video_frames=0 trainer.accelerator=cpu"
+
+
+def text(path: str | Path) -> str:
+    return (ROOT / path).read_text(encoding="utf-8")
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and mkdocs make them."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text(page), flags=re.M | re.S), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_the_readme_has_at_most_900_words():
+    """Everything counts: tables, commands and the bibliography too."""
+    assert len(text("README.md").split()) <= 900
+
+
+def test_the_readme_marks_the_two_commands_that_others_run():
+    marked = {block.note: block.text for block in blocks(text("README.md")) if block.note}
+    assert "launch.py --config configs/dc-ge.yaml" in marked["run"] and "-m pytest" in marked["test"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_links_lead_somewhere(page):
+    """Pages of the API are made with the site (docs/hooks.py), and are checked there."""
+    for link in LINK.findall(text(page)):
+        if link.startswith("http") or link.startswith("api/"):
+            continue
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file).resolve() if file else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_every_page_is_in_the_navigation():
+    def pages(entry) -> list[str]:
+        if isinstance(entry, str):
+            return [entry]
+        return [page for part in (entry.values() if isinstance(entry, dict) else entry) for page in pages(part)]
+
+    listed = pages(yaml.safe_load(text("mkdocs.yml"))["nav"])
+    assert len(set(listed)) == len(listed)
+    written = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert {page for page in listed if not page.startswith("api/")} == written
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_configs_and_files_that_pages_name_exist(page):
+    named = set(re.findall(r"\b((?:configs|benchmarks)/[\w/-]+\.(?:yaml|py))", text(page))) - HOSTS
+    assert not [name for name in named if not (ROOT / name).is_file()]
+
+
+def test_commands_that_need_something_say_so():
+    """A block that names a config which needs a GPU or a download is marked, and so never run by the tests."""
+    needs = {entry["path"]: set(entry["needs"]) for entry in yaml.safe_load(text("extension.yaml"))["configs"]}
+    for page in PAGES:
+        for block in blocks(text(page)):
+            heavy = {name for name, need in needs.items() if need & {"download", "gpu", "host"} and name in block.text}
+            assert not heavy or block.note.startswith("needs:"), (page.name, heavy)
+
+
+def test_a_page_becomes_a_script():
+    heavy, light = "false\n", "python launch.py --config a.yaml \\\n    b=1  # why\nls\n"
+    page = f"<!-- needs: gpu -->\n```bash\n{heavy}```\n\n```bash\n{light}```\n"
+    assert blocks(page) == [Block("needs: gpu", heavy), Block("", light)]
+    assert script(page, "c=2").splitlines()[1:] == ["python launch.py --config a.yaml      b=1 c=2", "ls"]
+
+
+@pytest.fixture
+def clone(tmp_path):
+    """What is committed, and nothing else: what a newcomer has."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    folder = tmp_path / "clone"
+    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
+    return folder
+
+
+@pytest.mark.slow
+def test_the_readmes_commands_run(clone):
+    """All that need no GPU, download or capture, shortened to eight steps. Installing, and the tests themselves, are
+    left to .ci/run, which does both as printed."""
+    page = re.sub(r"python3 -m venv .*? && (?=\.venv/bin/python)", "", text("README.md"))
+    page = page.replace(".venv/bin/python -m pytest", "true").replace(".venv/bin/python", "python")
+    assert page.count("python launch.py") >= 5
+    done = run(page, clone, SHORT)
+    assert done.returncode == 0, done.stdout
+    assert (clone / "outputs/fit/statue/save/last.ply").is_file()
+    assert len(list(clone.glob("outputs/closed-form/*/save/last.ply"))) == 1
+    assert len(list(clone.glob("outputs/dc-ge/*/report/index.html"))) == 1
+
+
+@pytest.mark.slow
+def test_the_tutorials_commands_run_and_lead_to_its_pictures(clone):
+    page = text("docs/tutorial.md")
+    done = run(page, clone, SHORT)
+    assert done.returncode == 0, done.stdout
+    pictures = list(PICTURE.finditer(page))
+    assert len(pictures) == page.count("](tutorial/") >= 6
+    for match in pictures:
+        assert len(list(clone.glob(re.sub(r"it\d+", "it*", match["source"])))) == 1, match["source"]
+        assert (ROOT / "docs" / match["target"]).is_file()
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    pytest.importorskip("material")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    api = (tmp_path / "site/api/render.html").read_text(encoding="utf-8")
+    assert "rasterize" in api and "pixel centres" in api
