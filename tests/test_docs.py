@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import subprocess
@@ -121,6 +122,21 @@ def test_the_tutorials_commands_run_and_lead_to_its_pictures(clone):
     for match in pictures:
         assert len(list(clone.glob(re.sub(r"it\d+", "it*", match["source"])))) == 1, match["source"]
         assert (ROOT / "docs" / match["target"]).is_file()
+
+
+@pytest.mark.slow
+def test_the_newcomers_of_the_page_on_extending_do_what_it_says(clone):
+    """A column of the metric, splats that the mask let the density control remove, and no complaint about the rule."""
+    page = text("docs/extend.md")
+    for name, code in re.findall(r"^```python\n(?=# (\w+\.py):)(.*?)^```$", page, re.MULTILINE | re.DOTALL):
+        (clone / name).write_text(code, encoding="utf-8")
+    done = run(page, clone, SHORT)
+    assert done.returncode == 0, done.stdout
+    trial = clone / "outputs/closed-form/newcomers"
+    with (trial / "report/error.csv").open(encoding="utf-8") as file:
+        first, *_, last = list(csv.DictReader(file))
+    assert float(last["mse_source"]) > 0 and int(last["splats"]) < int(first["splats"])
+    assert "rule dds-pull" in done.stdout and "mask (above)" in done.stdout
 
 
 @pytest.mark.slow
