@@ -39,19 +39,24 @@ def blocks(page: str) -> list[Block]:
     return [Block(match["note"] or "", match["text"]) for match in BLOCK.finditer(page)]
 
 
-def script(page: str, options: str = "") -> str:
-    """What of a page can be run anywhere, as one script. options: appended to every run of the launcher."""
+def script(page: str, steps: int = 0) -> str:
+    """What of a page can be run anywhere, as one script. steps: length of each run, and of a resumed one twice that;
+    0: as printed."""
     text = "".join(block.text for block in blocks(page) if not block.note.startswith("needs:"))
-    lines = text.replace("\\\n", " ").splitlines()
-    runs = re.compile(r"^(python launch\.py .*?)(\s+#.*)?$")
-    return "set -euo pipefail\n" + "".join(runs.sub(rf"\1 {options}", line) + "\n" for line in lines)
+    lines = ["set -euo pipefail", *text.replace("\\\n", " ").splitlines()]
+    for i, line in enumerate(lines):
+        if steps and line.startswith("python launch.py"):
+            length = 2 * steps if "resume=" in line else steps
+            command = line.partition("  # ")[0]
+            lines[i] = f"{command.rstrip()} trainer.max_steps={length} system.report.video_frames=0"
+    return "\n".join(lines) + "\n"
 
 
-def run(page: str, folder: Path, options: str = "") -> subprocess.CompletedProcess:
-    """Run a page's commands in `folder`, by this Python; what they say comes back as text."""
+def run(page: str, folder: Path, steps: int = 0) -> subprocess.CompletedProcess:
+    """Run a page's commands in `folder`, by this Python; what they say comes back as text. steps: as of `script`."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
     return subprocess.run(
-        ["bash", "-c", script(page, options)],
+        ["bash", "-c", script(page, steps)],
         cwd=folder,
         env={**os.environ, "PATH": path},
         stdin=subprocess.DEVNULL,
