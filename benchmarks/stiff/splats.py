@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from dreamcatalyst.data.camera import Cameras
-from dreamcatalyst.data.views import open_capture
+from dreamcatalyst.data.loader import open_capture
 from dreamcatalyst.render.api import rasterize
 from dreamcatalyst.render.projection import project
 from dreamcatalyst.render.thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN

@@ -11,7 +11,8 @@ import pycolmap
 import pytest
 import torch
 from dreamcatalyst.data import colmap
-from dreamcatalyst.data.views import CaptureOptions, open_capture
+from dreamcatalyst.data.formats import CaptureOptions
+from dreamcatalyst.data.loader import open_capture
 from dreamcatalyst.errors import ConfigError, DataError
 
 WIDTH, HEIGHT = 64, 48

@@ -8,7 +8,8 @@ import math
 import pytest
 import torch
 from dreamcatalyst.data import inria
-from dreamcatalyst.data.views import CaptureOptions, open_capture
+from dreamcatalyst.data.formats import CaptureOptions
+from dreamcatalyst.data.loader import open_capture
 from dreamcatalyst.errors import DataError
 
 # At (1, 2, 3), camera to world: image right is world y, image down is world z, forward is world x.

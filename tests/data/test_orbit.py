@@ -9,8 +9,8 @@ import pytest
 import torch
 from dreamcatalyst.config import parse
 from dreamcatalyst.data.camera import Cameras, look_at
+from dreamcatalyst.data.formats import CaptureOptions
 from dreamcatalyst.data.orbit import FOV, MARGIN, common_point, orbit_capture, video_path
-from dreamcatalyst.data.views import CaptureOptions
 from dreamcatalyst.errors import ConfigError, DataError
 from dreamcatalyst.scene.gaussians import Gaussians
 from hypothesis import given, settings

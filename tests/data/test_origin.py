@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst.data.loader import open_capture
 from dreamcatalyst.data.origin import ZERO, far_origin
-from dreamcatalyst.data.views import open_capture
 from dreamcatalyst.scene.ply import ply_origin, read_ply, write_ply
 from dreamcatalyst.scene.plyfile import read_vertices
 

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst.data.formats import CaptureOptions
+from dreamcatalyst.data.loader import open_capture
 from dreamcatalyst.data.transforms import splats_from_capture
-from dreamcatalyst.data.views import CaptureOptions, open_capture
 from dreamcatalyst.errors import DataError
 
 # A camera at (1, 2, 3) whose OpenGL axes are the world's: it looks along -z, y is up.

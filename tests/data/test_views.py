@@ -14,9 +14,12 @@ import numpy as np
 import pytest
 import torch
 from dreamcatalyst.config import parse
+from dreamcatalyst.data.formats import CaptureOptions
 from dreamcatalyst.data.images import ImageCache, Photo, image_size
 from dreamcatalyst.data.lens import Lens
-from dreamcatalyst.data.views import Capture, CaptureOptions, fit, open_capture, split, views_for_step
+from dreamcatalyst.data.loader import open_capture
+from dreamcatalyst.data.sizes import fit
+from dreamcatalyst.data.views import Capture, split, views_for_step
 from dreamcatalyst.errors import DataError, DreamCatalystError
 from hypothesis import given
 from hypothesis import strategies as st
@@ -112,13 +115,13 @@ def test_photographs_of_more_pixels_than_pillow_takes_are_opened(tmp_path, monke
 
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
     assert len(capture(tmp_path)) == 3 and Image.MAX_IMAGE_PIXELS == 1000
-    monkeypatch.setattr("dreamcatalyst.data.views.free_memory", lambda: 12 * WIDTH * HEIGHT - 1)
+    monkeypatch.setattr("dreamcatalyst.data.sizes.free_memory", lambda: 12 * WIDTH * HEIGHT - 1)
     with pytest.raises(DataError, match="000.png: 64x48 pixels need .* GiB are free. Make smaller copies"):
         open_capture(tmp_path, CaptureOptions(max_side=2))
 
 
 def test_views_that_memory_cannot_hold_are_refused(monkeypatch):
-    monkeypatch.setattr("dreamcatalyst.data.views.free_memory", lambda: 2**30)
+    monkeypatch.setattr("dreamcatalyst.data.sizes.free_memory", lambda: 2**30)
     with pytest.raises(DataError, match="views of 20000x10000 pixels need 18.6 GiB, and 1.0 GiB are free. Set data"):
         fit(20000, 10000, CaptureOptions())
     assert fit(20000, 10000, CaptureOptions(max_side=1000))[1:] == (1000, 500)

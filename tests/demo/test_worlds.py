@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from dreamcatalyst.data.views import CaptureOptions
-from dreamcatalyst.demo.capture import world_capture
+from dreamcatalyst.data.formats import CaptureOptions
+from dreamcatalyst.data.loader import open_capture
+from dreamcatalyst.demo import capture as demo_capture
 from dreamcatalyst.demo.worlds import BEAR, PARTS, bear_statue, make_world, part_mask, statue_world
 from dreamcatalyst.errors import ConfigError, DataError
 from dreamcatalyst.render.api import rasterize
@@ -82,14 +83,25 @@ def test_cameras_look_at_the_statue_upright(world):
     assert ((-world.cameras.viewmats[:, 1, :3] @ torch.tensor(world.up)) > 0.8).all()
 
 
-def test_a_world_as_a_capture(world):
-    capture = world_capture(world, "statue", CaptureOptions(width=12, height=12, test_every=3))
-    assert (len(capture), capture.test, capture.has_photos) == (6, [0, 3], False)
-    torch.testing.assert_close(capture.cameras().Ks, world.cameras.resized(12, 12).Ks)
+def test_a_world_as_a_capture(world, monkeypatch):
+    monkeypatch.setattr(demo_capture, "make_world", lambda name: world)
+    capture = open_capture("demo:statue", CaptureOptions(width=12, height=12, test_every=3))
+    assert (str(capture.source), len(capture), capture.test, capture.has_photos) == ("demo:statue", 6, [0, 3], True)
+    cameras = world.cameras.resized(12, 12)
+    assert torch.equal(capture.cameras().Ks, cameras.Ks) and torch.equal(capture.cameras().viewmats, cameras.viewmats)
     assert 1000 < len(capture.points.xyz) <= 6000
     assert capture.points.rgb.amin() >= 0 and capture.points.rgb.amax() <= 1
     with pytest.raises(DataError, match="'0001' has a camera but no photograph"):
         capture.image(1)
+    image = rasterize(world.scene, cameras[1]).rgb[0]
+    assert torch.equal(capture.image(1, lambda scene, camera: rasterize(scene, camera).rgb[0]), image)
+    with pytest.raises(DataError, match="demo:statue: carries splats.*Leave out data.dataparser"):
+        capture.transformed(torch.eye(4))
+
+
+def test_only_a_format_that_is_asked_for_is_looked_for():
+    with pytest.raises(DataError, match="demo:statue: is no capture. Looked for inria: cameras.json.*Found no such"):
+        open_capture("demo:statue", CaptureOptions(format="inria"))
 
 
 def test_an_unknown_world_is_named():

@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from dreamcatalyst.data.formats import CaptureOptions
+from dreamcatalyst.data.loader import open_capture
 from dreamcatalyst.data.orbit import video_path
-from dreamcatalyst.data.views import CaptureOptions, open_capture
 from dreamcatalyst.errors import ConfigError, DataError
 from dreamcatalyst.scene.gaussians import Gaussians
 from dreamcatalyst.train.datamodule import SplatData

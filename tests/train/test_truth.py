@@ -3,10 +3,9 @@
 import json
 
 import pytest
-import torch
+from dreamcatalyst.demo.capture import scan_world
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.render.api import rasterize
-from dreamcatalyst.train.truth import find_truth
 
 from tests.diffusion.small_model import make_model
 
@@ -54,7 +53,7 @@ def test_a_prompt_that_the_model_was_not_taught_is_warned_of(launch, model, caps
 
 def test_the_region_holds_all_that_changes():
     world = make_world("statue", size=48)
-    truth = find_truth(world, PANDA, torch.device("cpu"))
+    truth = scan_world(world).truths.find(PANDA)
     camera = world.cameras[:1]
     region = truth.region(rasterize, camera)
     difference = (truth.image(rasterize, camera) - rasterize(world.scene, camera).rgb[0].clamp(0, 1)).abs().amax(-1)
@@ -64,7 +63,7 @@ def test_the_region_holds_all_that_changes():
 
 
 def test_no_truth_where_none_is_known():
-    world = make_world("statue", size=16)
-    assert find_truth(None, PANDA, torch.device("cpu")) is None
-    assert find_truth(world, "Turn it into a dragon", torch.device("cpu")) is None
-    assert find_truth(world, "Make the ball green", torch.device("cpu")) is None  # there is no ball
+    truths = scan_world(make_world("statue", size=16)).truths
+    assert PANDA in truths.instructions and truths.find(PANDA.upper() + "!") is not None
+    assert truths.find("Turn it into a dragon") is None
+    assert truths.find("Make the ball green") is None  # there is no ball

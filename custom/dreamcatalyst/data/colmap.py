@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from ..errors import DataError, unknown
+from .formats import CaptureOptions, Format, Points, Scan, Shot
 from .images import SUFFIXES
 from .lens import Lens
-from .views import CaptureOptions, Format, Points, Scan, Shot
 
 if TYPE_CHECKING:
     import pycolmap

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DataError
+from .formats import CaptureOptions, Format, Scan, Shot, read_json
 from .lens import Lens
-from .views import CaptureOptions, Format, Scan, Shot, read_json
 
 NAME = "cameras.json"
 KEYS = ("width", "height", "position", "rotation", "fx", "fy")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -13,7 +12,10 @@ from torch.nn.functional import normalize
 
 from ..errors import DataError
 from .camera import Cameras, look_at
-from .views import AXES, Capture, CaptureOptions, View, fit, split
+from .formats import AXES, CaptureOptions
+from .sizes import fit
+from .truth import SplatScene
+from .views import Capture, View, split
 
 SIZE = 512  # pixels of an orbit's square images
 FOV = 50.0  # degrees, of an image's shorter side
@@ -23,15 +25,7 @@ MARGIN = 1.6
 ROUND = 300.0  # degrees of azimuth from which on a capture goes round
 
 
-class Splats(Protocol):
-    """What an orbit needs of a scene (a Gaussians has it): middles, standard deviations and opacities."""
-
-    means: Tensor
-    scales: Tensor
-    opacities: Tensor
-
-
-def orbit_capture(scene: Splats, options: CaptureOptions) -> Capture:
+def orbit_capture(scene: SplatScene, options: CaptureOptions) -> Capture:
     """Views without photographs on a ring around the opacity-weighted mean of the splats.
 
     The ring's height waves between 0 and 30 degrees above the middle. Its radius is such that a ball of MARGIN times

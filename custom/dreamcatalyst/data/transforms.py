@@ -12,9 +12,9 @@ from torch import Tensor
 
 from ..config import Range
 from ..errors import DataError, unknown
+from .formats import CaptureOptions, Format, Points, Scan, Shot, read_json
 from .images import SUFFIXES, image_size, there
 from .lens import FINITE, FOCAL, SIDE, Lens
-from .views import CaptureOptions, Format, Points, Scan, Shot, read_json
 
 NAME = "transforms.json"
 FISHEYE = {"OPENCV_FISHEYE"}

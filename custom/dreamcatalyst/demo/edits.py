@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from ..data.truth import normalised
 from ..errors import choose
 from ..scene.gaussians import Gaussians
 from .additions import party_hat, rabbit_ears, scarf, with_addition
@@ -203,11 +203,6 @@ def _table() -> dict[str, Edit]:
 
 
 EDITS: dict[str, Edit] = _table()
-
-
-def normalised(instruction: str) -> str:
-    """`instruction` without case, punctuation and spare spaces."""
-    return " ".join(re.findall(r"[^\W_]+", instruction.casefold()))
 
 
 _BY_PHRASE = {normalised(phrase): edit for edit in EDITS.values() for phrase in edit.phrases}

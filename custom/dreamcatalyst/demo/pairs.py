@@ -13,7 +13,7 @@ from numpy.random import Generator
 from torch import Tensor
 
 from ..data.camera import Cameras
-from ..data.views import read_json
+from ..data.formats import read_json
 from ..errors import DataError
 from ..files import replacing, write_text
 from ..render.api import rasterize

@@ -40,7 +40,7 @@ class Prior(ABC):
     takes_image: whether the image condition means anything (False for text-to-image models).
     exact: whether the edit of an image is known in closed form (`known_edit`).
     draws_latents: whether latents are drawn from a posterior at every use, with noise that the caller gives.
-    takes_truth: whether it must be told what each view of a made world becomes (diffusion/world_truth.py).
+    takes_truth: whether it must be told what each view becomes (diffusion/world_truth.py).
     instructions: all that the prior was taught, wordings by edit; None where it is open to any.
     """
 

@@ -1,33 +1,41 @@
-"""The closed form around a truth in 3D: what a made world becomes, as each view would show it.
+"""The closed form around a truth in 3D: what a capture becomes by an edit, as each view would show it.
 
-An image operator cannot make what was not there. This prior is asked about views of a made world, and x_0 given image
-and instruction lies around the render of the *edited* world from the same camera: all views agree, and an edit may add.
-It is the oracle for edits that grow; on a capture there is no such truth, and the closed form or a network serves.
+An image operator cannot make what was not there. This prior is asked about views of a capture whose edits are known in
+3D (a made world), and x_0 given image and instruction lies around the render of the *edited* scene from the same
+camera: all views agree, and an edit may add. It is the oracle for edits that grow; of photographs there is no such
+truth, and the closed form or a network serves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from ..demo.edits import EDITS, Edit, find_edit
-from ..errors import PriorError, nearest
+from ..errors import PriorError
 from .closed_form import ClosedForm, SourceImage
 
 
 @dataclass
 class Source:
-    """Where the truth comes from. image: number of a view to the edited world there, [H,W,3] in [0,1]."""
+    """Where the truth comes from. image: number of a view to the edited scene there, [H,W,3] in [0,1]."""
 
     image: Callable[[int], Tensor] | None = None
 
 
+@dataclass(frozen=True)
+class Instruction:
+    """A text that is not empty; whatever it says, it asks for the edit whose truth the prior was told."""
+
+    name: str
+
+
 class WorldTruth(ClosedForm):
-    """x_0 | image, y ~ N(render of the edited world, s^2); the rest as in ClosedForm. `truth.image` is set by the run
-    that has the world, before the first view is asked about."""
+    """x_0 | image, y ~ N(render of the edited scene, s^2); the rest as in ClosedForm. `truth.image` is set by the run
+    that knows it, before the first view is asked about."""
 
     takes_truth = True
 
@@ -40,30 +48,25 @@ class WorldTruth(ClosedForm):
         other.truth = self.truth
         return other
 
-    def embed(self, prompts: Sequence[str]) -> list[Edit | None]:
-        """The made world's edit that each instruction names; None for an empty one. Raises PriorError."""
-        found = []
-        for prompt in prompts:
-            edit = find_edit(prompt) if prompt.strip() else None
-            if edit is None and prompt.strip():
-                known = [each.phrases[0] for each in EDITS.values() if each.phrases[0]]
-                raise PriorError(
-                    f"world-truth: no edit of made worlds is called '{prompt}'.{nearest(prompt, known)} "
-                    f"Known, in several wordings: {', '.join(known)}."
-                )
-            found.append(edit)
-        return found
+    def embed(self, prompts: Sequence[str]) -> list[Instruction | None]:
+        """Any instruction; None, the identity, for an empty one."""
+        return [_instruction(prompt) if prompt.strip() else None for prompt in prompts]
 
     @torch.no_grad()
     def condition_of(self, images: Tensor, view: int) -> SourceImage:
         if self.truth.image is None:
             raise PriorError(
-                "world-truth: there is no edited world to look at. This prior is for made worlds whose edit is known: "
+                "world-truth: there is no edited scene to look at. This prior is for made worlds whose edit is known: "
                 "data.source=demo:statue; photographs need another one, such as prior_type=closed-form"
             )
-        made = SourceImage(self.encode(images))
+        condition = SourceImage(self.encode(images))
         shown = self.truth.image(view).to(images).permute(2, 0, 1)[None]
         if shown.shape != images.shape:
             raise PriorError(f"world-truth: view {view} is {tuple(images.shape)}, its truth {tuple(shown.shape)}")
-        made.assume(self.encode(shown))
-        return made
+        condition.assume(self.encode(shown))
+        return condition
+
+
+@lru_cache(maxsize=64)
+def _instruction(prompt: str) -> Instruction:
+    return Instruction(prompt)

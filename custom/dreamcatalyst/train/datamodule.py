@@ -12,11 +12,13 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from .. import plugin
 from ..config import AtLeastOne, Seed, parse
+from ..data.formats import CaptureOptions
 from ..data.inria import beside as cameras_beside
+from ..data.loader import has_prefix, open_capture
+from ..data.orbit import orbit_capture
 from ..data.origin import ZERO, Origin
-from ..data.views import DRAWN, Capture, CaptureOptions, open_capture, require_memory, views_for_step
-from ..demo.capture import PREFIX, world_capture
-from ..demo.worlds import World, make_world
+from ..data.sizes import DRAWN, require_memory
+from ..data.views import Capture, views_for_step
 from ..errors import ConfigError
 from ..scene.gaussians import Gaussians
 from ..scene.ply import ply_origin
@@ -32,16 +34,15 @@ class StepViews(IterableDataset):
     def __iter__(self) -> Iterator[dict[str, Any]]:
         train, batch, seed = self.data.capture.train, self.data.cfg.batch_size, self.data.cfg.seed
         for step in count(self.data.trainer.global_step):
-            if self.data.capture.has_photos:
-                ahead = views_for_step(seed, step + 1, len(train), batch)
-                self.data.capture.prefetch([train[i] for i in ahead])
+            ahead = views_for_step(seed, step + 1, len(train), batch)
+            self.data.capture.prefetch([train[i] for i in ahead])
             visits = [place // len(train) for place in range(step * batch, (step + 1) * batch)]
             yield {"index": [train[i] for i in views_for_step(seed, step, len(train), batch)], "visit": visits}
 
 
 @plugin.register("dreamcatalyst-data")
 class SplatData(plugin.pl.LightningDataModule):
-    """Views of a capture folder (COLMAP, nerfstudio, INRIA's cameras.json), of a made world, or around given splats."""
+    """Views of a capture in any format of data/formats.py, or around given splats."""
 
     @dataclass(frozen=True)
     class Config(CaptureOptions):
@@ -55,10 +56,9 @@ class SplatData(plugin.pl.LightningDataModule):
         super().__init__()
         self.cfg = parse(self.Config, cfg or {}, "data")
         self.capture: Capture | None = None
-        self.world: World | None = None
         self._origins: dict[str, Origin] = {}
-        if self.cfg.source and self.cfg.source.startswith(PREFIX):
-            self.world = make_world(self.cfg.source.removeprefix(PREFIX))
+        if self.cfg.source and has_prefix(self.cfg.source):  # no path but a name, which is known or not
+            self.open()
 
     def open(self, scene: Gaussians | None = None, splats: str = "") -> Capture:
         """The capture, read at the first call. Where there is no source: the cameras that 3DGS wrote beside the file
@@ -66,15 +66,11 @@ class SplatData(plugin.pl.LightningDataModule):
         views than there are."""
         if self.capture is not None:
             return self.capture
-        if self.world is not None:
-            self.capture = world_capture(self.world, self.cfg.source.removeprefix(PREFIX), self.cfg)
-        elif self.cfg.source:
+        if self.cfg.source:
             self.capture = open_capture(self.cfg.source, self.cfg)
         elif splats and (cameras := cameras_beside(Path(splats))) is not None:
             self.capture = open_capture(cameras, self.cfg)
         elif scene is not None:
-            from ..data.orbit import orbit_capture
-
             self.capture = orbit_capture(scene, self.cfg)
         else:
             raise ConfigError("data.source: nothing is given. Name a capture folder or demo:statue.")
@@ -106,7 +102,7 @@ class SplatData(plugin.pl.LightningDataModule):
         return self._origins[splats]
 
     def _find_origin(self, splats: str) -> Origin:
-        if self.world is not None or not (self.cfg.source or splats):
+        if not (self.cfg.source or splats):
             return ZERO
         if self.cfg.source or cameras_beside(Path(splats)) is not None:
             return self.open(None, splats).origin

@@ -15,7 +15,7 @@ from .system import SplatSystem
 
 @plugin.register("dreamcatalyst-edit-system")
 class EditSystem(SplatSystem):
-    """Edits the splats of gs_source (or of a made world) as the instruction says."""
+    """Edits the splats of gs_source (or those that the capture carries) as the instruction says."""
 
     Method = EditMethod
     Parts = EditParts

@@ -14,8 +14,8 @@ from torch import Tensor
 from .. import plugin
 from ..cache import ByteCache
 from ..data.camera import Cameras
-from ..demo.edits import normalised
-from ..errors import ConfigError, SceneError, choose
+from ..data.truth import GroundTruth, normalised
+from ..errors import ConfigError, PriorError, SceneError, choose, nearest
 from ..guidance.guidance import Guidance, chosen_prior
 from ..loss.anchor import anchor_loss, anchor_step
 from ..loss.perceptual import Lpips
@@ -35,7 +35,6 @@ from .plan import PlanBuilder, scene_bytes
 from .preview import preview_sheet
 from .region import EditRegion, dilate, restrict_to_mask
 from .source import SourceViews
-from .truth import Truth, find_truth
 
 PHOTO_WARNING_DB = 15.0  # below it a source render and its photograph have hardly anything in common
 
@@ -51,7 +50,7 @@ def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> 
 
 
 class EditMethod(Method):
-    """Edits the splats of gs_source (or of a made world) as the instruction says.
+    """Edits the splats of gs_source (or those that the capture carries) as the instruction says.
 
     guidance, source, perceptual, truth: None until `prepare`.
     """
@@ -66,7 +65,7 @@ class EditMethod(Method):
         part.mask.segmenter()
         self.guidance: Guidance | None = None
         self.source: SourceViews | None = None
-        self.truth: Truth | None = None
+        self.truth: GroundTruth | None = None
         self.perceptual: Lpips | None = None
         self.generations = part.anchor.generations()
         self._references = ByteCache(self._cache_bytes)
@@ -105,12 +104,21 @@ class EditMethod(Method):
 
     def _find_truth(self) -> None:
         # Splats of one's own are another scene, and a prior that is exact has a truth of its own.
-        whole = not (self.cfg.gs_source or self.cfg.original or self.guidance.prior.exact)
-        asked = self.guidance.prior.takes_truth
-        world = self.context.data.world if whole or asked else None
-        self.truth = find_truth(world, self.part.prompt_processor.prompt, self.context.device)
-        if asked and self.truth is not None:
-            self.guidance.prior.truth.image = lambda index: self.truth.image(self.draw, self.camera(index))
+        prior, prompt = self.guidance.prior, self.part.prompt_processor.prompt
+        whole = not (self.cfg.gs_source or self.cfg.original or prior.exact)
+        if not self.context.data.cfg.source or not (whole or prior.takes_truth):
+            return
+        capture = self.context.data.open()
+        truth = capture.truth(prompt)
+        self.truth = None if truth is None else truth.to(self.context.device)
+        if prior.takes_truth and truth is None and capture.truths is not None:
+            known = capture.truths.instructions
+            raise PriorError(
+                f"prior_type: no outcome of '{prompt}' is known in {capture.source}.{nearest(prompt, known)} "
+                f"Known, in several wordings: {', '.join(known)}."
+            )
+        if prior.takes_truth and truth is not None:
+            prior.truth.image = lambda index: self.truth.image(self.draw, self.camera(index))
 
     @cached_property
     def fitted(self) -> Fitted | None:
@@ -181,16 +189,12 @@ class EditMethod(Method):
         self.compare_with_photos()
 
     def compare_with_photos(self) -> None:
-        """Warn where renders of the source have nothing to do with the photographs of the same cameras; a made world's
-        are its own renders."""
-        world, capture = self.context.data.world, self.capture
-        if not capture.has_photos and (world is None or not self.cfg.gs_source):
+        """Warn where renders of the source have nothing to do with the photographs of the same cameras."""
+        capture = self.capture
+        if not capture.has_photos or (capture.scene is not None and not self.cfg.gs_source):  # then they are the same
             return
         some = capture.train[:: max(1, len(capture.train) // 4)][:4]
-        if world is None:
-            photos = [capture.image(i) for i in some]
-        else:
-            photos = [self.draw(world.scene.to(self.context.device), self.camera(i)).rgb[0].cpu() for i in some]
+        photos = [self.photo(i).cpu() for i in some]
         values = [psnr(self.source.render(i)[None].cpu(), photo[None]) for i, photo in zip(some, photos, strict=True)]
         mean = float(torch.cat(values).mean())
         if mean < PHOTO_WARNING_DB:

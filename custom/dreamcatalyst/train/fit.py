@@ -14,25 +14,20 @@ from ..config import Between, Count, Fraction, Range
 from ..errors import DataError
 from ..loss.image import photometric_loss
 from ..render.api import Render
-from ..report.clock import Clock
 from ..scene.create import from_mesh, from_points
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
-from .method import Method, MethodParts
+from .method import Method
 from .system import SplatSystem
 
 
 class FitMethod(Method):
     """Fits splats to the training photographs; begins with the reconstruction's points, a mesh, or a PLY of splats."""
 
-    def __init__(self, cfg: Any, part: MethodParts, clock: Clock):
-        super().__init__(cfg, part, clock)
-        self._renders: dict[int, Tensor] = {}
-
     def first_scene(self) -> Gaussians:
         cfg, data = self.cfg, self.context.data
         capture = data.open()
-        if not capture.has_photos and data.world is None:
+        if not capture.has_photos:
             raise DataError(f"{capture.source}: has cameras but no photographs, and a fit needs some.")
         if cfg.gs_source:
             return self.given_scene()
@@ -61,17 +56,6 @@ class FitMethod(Method):
 
     def references(self, index: int) -> dict[str, Tensor]:
         return {"photo": self.photo(index)}
-
-    @torch.no_grad()
-    def photo(self, index: int) -> Tensor:
-        """The photograph of one view, [H,W,3] in [0,1]; of a made world, its render."""
-        world = self.context.data.world
-        if world is None:
-            return self.capture.image(index)
-        if index not in self._renders:
-            scene = world.scene.to(self.context.device)
-            self._renders[index] = self.draw(scene, self.camera(index)).rgb[0].clamp(0, 1)
-        return self._renders[index]
 
 
 @plugin.register("dreamcatalyst-fit-system")

@@ -150,14 +150,14 @@ class Method:
             self.density.begin(self.splats)
 
     def given_scene(self) -> Gaussians:
-        """The splats of gs_source, or of the made world. Raises ConfigError where there are neither."""
+        """The splats of gs_source, or those that the capture carries. Raises ConfigError where there are neither."""
         data = self.context.data
         if self.cfg.gs_source:
             return read_splats(self.cfg.gs_source, drop_nonfinite=self.cfg.drop_nonfinite, origin=self.origin)
-        if data.world is not None:
-            return data.world.scene
         if data.cfg.source:  # where that is wrong, too, it is the first thing to say
-            data.open()
+            capture = data.open()
+            if capture.scene is not None:
+                return capture.scene
         raise ConfigError(
             "system.gs_source: no splats are given. Name a PLY; configs/fit.yaml makes one from photographs."
         )
@@ -191,6 +191,15 @@ class Method:
     def camera(self, index: int | list[int]) -> Cameras:
         """The cameras of these views, one batch."""
         return self.capture.cameras([index] if isinstance(index, int) else index)
+
+    @torch.no_grad()
+    def photo(self, index: int) -> Tensor:
+        """The photograph of one view, [H,W,3] in [0,1]; of a capture that carries splats, their render."""
+
+        def render(scene: Gaussians, camera: Cameras) -> Tensor:
+            return self.draw(scene.to(self.context.device), camera).rgb[0].clamp(0, 1)
+
+        return self.capture.image(index, render)
 
     # --- drawing
 
