@@ -114,7 +114,7 @@ class EditMethod(Method):
         if prior.takes_truth and truth is None and capture.truths is not None:
             known = capture.truths.instructions
             raise PriorError(
-                f"prior_type: no outcome of '{prompt}' is known in {capture.source}.{nearest(prompt, known)} "
+                f"system.guidance.prior_type: no outcome of '{prompt}' is known in {capture.source}.{nearest(prompt, known)} "
                 f"Known, in several wordings: {', '.join(known)}."
             )
         if prior.takes_truth and truth is not None:
