@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from dreamcatalyst.data.views import FORMATS
+from dreamcatalyst.data.formats import FORMATS
 from dreamcatalyst.diffusion.api import PRIORS
 from dreamcatalyst.guidance.rules import RULES
 from dreamcatalyst.render.api import BACKENDS

@@ -114,8 +114,8 @@ class EditMethod(Method):
         if prior.takes_truth and truth is None and capture.truths is not None:
             known = capture.truths.instructions
             raise PriorError(
-                f"system.guidance.prior_type: no outcome of '{prompt}' is known in {capture.source}.{nearest(prompt, known)} "
-                f"Known, in several wordings: {', '.join(known)}."
+                f"system.guidance.prior_type: no outcome of '{prompt}' is known in {capture.source}."
+                f"{nearest(prompt, known)} Known, in several wordings: {', '.join(known)}."
             )
         if prior.takes_truth and truth is not None:
             prior.truth.image = lambda index: self.truth.image(self.draw, self.camera(index))
