@@ -12,11 +12,12 @@ import cv2
 import numpy as np
 import pytest
 from dreamcatalyst.data.formats import FORMATS
+from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.diffusion.api import PRIORS
 from dreamcatalyst.guidance.rules import RULES
 from dreamcatalyst.render.api import BACKENDS
 from dreamcatalyst.report.metrics import METRICS
-from dreamcatalyst.scene.ply import read_ply
+from dreamcatalyst.scene.ply import read_ply, write_ply
 from dreamcatalyst.segment.api import SEGMENTERS
 from dreamcatalyst.train.density import DENSITY
 
@@ -104,6 +105,14 @@ def test_a_backend_draws(edit):
 
     drawn, swapped = picture("system.renderer.backend=reference"), picture("system.renderer.backend=swapped")
     assert np.abs(drawn[..., ::-1].astype(int) - swapped).max() <= 1 < np.abs(drawn.astype(int) - swapped).max()
+
+
+def test_a_format_is_found_by_its_files(edit, tmp_path):
+    (tmp_path / "eyes").mkdir()
+    (tmp_path / "eyes" / "eyes.txt").write_text("4 0 1\n0 4 1\n-4 0 1\n0 -4 1\n")
+    splats = write_ply(tmp_path / "statue.ply", make_world("statue").scene)
+    trial = edit("format", f"data.source={tmp_path / 'eyes'}", f"system.gs_source={splats}", "data.test_every=3")
+    assert json.loads((trial / "report" / "summary.json").read_text())["held_out"] == ["eye-0", "eye-3"]
 
 
 def test_a_rule_moves_the_splats_otherwise(edit):
