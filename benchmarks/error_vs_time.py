@@ -86,7 +86,7 @@ def demo_bench(args: argparse.Namespace) -> Bench | str:
 def capture_bench(args: argparse.Namespace) -> Bench | str:
     """Edits of a real capture on the exact prior, all rules at rest at T(I); in words, why not."""
     from dreamcatalyst.config import parse
-    from dreamcatalyst.guidance.guidance import GuidanceConfig
+    from dreamcatalyst.guidance.config import GuidanceConfig
 
     from benchmarks.precision.balance import balanced_scale, common_prior
 

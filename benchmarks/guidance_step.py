@@ -39,7 +39,9 @@ from dreamcatalyst.diffusion.api import Prior, Row  # noqa: E402
 from dreamcatalyst.diffusion.autoencoder import Autoencoder, load_autoencoder  # noqa: E402
 from dreamcatalyst.diffusion.folder import open_folder  # noqa: E402
 from dreamcatalyst.diffusion.noise import abar_at, add_noise  # noqa: E402
-from dreamcatalyst.guidance.guidance import VIEW_BYTES, Guidance, GuidanceConfig, chosen_rule, chosen_schedule  # noqa: E402
+from dreamcatalyst.guidance.config import GuidanceConfig, chosen_rule, chosen_schedule  # noqa: E402
+from dreamcatalyst.guidance.guidance import Guidance  # noqa: E402
+from dreamcatalyst.guidance.prompted import VIEW_BYTES  # noqa: E402
 
 from tests.diffusion.small_model import FULL, SMALL, make_model, make_tiny_autoencoder  # noqa: E402
 
@@ -100,6 +102,7 @@ def with_rule(guidance: Guidance, rule: str) -> Guidance:
     other.config = replace(guidance.config, rule=rule)
     other.rule = chosen_rule(other.config)
     other.schedule = chosen_schedule(other.config, other.rule)
+    other.objective = other.begin(other.rule)
     return other
 
 
@@ -114,6 +117,7 @@ def with_prior(guidance: Guidance, **changes: Any) -> Guidance:
     prior.autoencoder = Autoencoder(vae, folder)
     if prior.config.checkpointing:
         prior.autoencoder.enable_checkpointing()
+    other.objective = other.begin(other.rule)
     return other
 
 
@@ -147,7 +151,7 @@ def plain_step(
             ),
         )
     timestep = guidance.schedule.timestep(step, LENGTH, prior.alphas_cumprod)
-    noise, abar = guidance._noise(x, [VIEW], step), abar_at(prior.alphas_cumprod, timestep)
+    noise, abar = guidance.noise(x, [VIEW], step), abar_at(prior.alphas_cumprod, timestep)
     null = prior.embed([""])[0]
     text = torch.stack([guidance.text, null, null])
     image = torch.cat([condition, condition, torch.zeros_like(condition)])
@@ -190,7 +194,7 @@ def measure(step: Callable[..., Tensor], source: Tensor, args: argparse.Namespac
 
 
 def measure_ours(guidance: Guidance, source: Tensor, args: argparse.Namespace) -> dict:
-    guidance.view(source[0], VIEW)  # source and condition are encoded once, not in each step
+    guidance.encode_source(source[0], VIEW)  # source and condition are encoded once, not in each step
     return measure(partial(our_step, guidance), source, args, watch=guidance.prior)
 
 

@@ -20,6 +20,7 @@ FOLDERS = {
     "diffusion": "Priors: diffusion models, and the closed form.",
     "guidance": "Rules, timesteps, distillation.",
     "segment": "Masks.",
+    "host": "Rules inside threestudio's own systems.",
     "loss": "Image losses and anchors.",
     "report": "Metrics, tables, pictures, the page of a run.",
     "train": "Methods and systems: what a run does.",

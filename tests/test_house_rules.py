@@ -42,6 +42,7 @@ OUTSIDE = {  # files of the top level that stand outside the order, and what eac
     "signals": set(),
     "link": {"errors"},
     "imports": {"errors"},
+    "host": {"config", "diffusion", "errors", "guidance", "plugin"},
 }
 HOST = {"threestudio", "lightning", "pytorch_lightning"}
 HEAVY = {"pycolmap", "diffusers", "transformers", "gsplat", "trimesh", "imageio", "matplotlib"}

@@ -14,7 +14,8 @@ from dreamcatalyst.demo.edits import EDITS, NOTHING
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.diffusion.folder import SHIPPED, SHIPPED_NAME
 from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.guidance import Guidance
 from dreamcatalyst.render.api import rasterize
 from dreamcatalyst.report.metrics import psnr
 from dreamcatalyst.segment.relevance import Relevance

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from dreamcatalyst.config import load_config, parse
 from dreamcatalyst.diffusion.noise import stable_diffusion_schedule
-from dreamcatalyst.guidance.guidance import GuidanceConfig, chosen_rule, chosen_schedule
+from dreamcatalyst.guidance.config import GuidanceConfig, chosen_rule, chosen_schedule
 from dreamcatalyst.scene.generations import Generations
 from dreamcatalyst.train.edit import EditSystem
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from dreamcatalyst.diffusion.closed_form import ClosedForm, noise_slope
 from dreamcatalyst.diffusion.noise import abar_at
+from dreamcatalyst.guidance.config import GuidanceConfig, chosen_rule, chosen_schedule
 from dreamcatalyst.guidance.fixed_point import balanced
-from dreamcatalyst.guidance.guidance import GuidanceConfig, chosen_rule, chosen_schedule
-from dreamcatalyst.guidance.rules import EDIT_NULL
+from dreamcatalyst.guidance.rules import EDIT_NULL, Rule
 
 PAPER = 7.5, 1.5  # w_y, w_I
 
@@ -27,7 +27,7 @@ def balanced_scale(prior: ClosedForm, config: GuidanceConfig) -> float:
     """w_y at which the rule of `config` rests at the edit on `prior` (whose s_image equals its s_null); for rules that
     compare pictures 1, at which the prior's own samples are those of the edit."""
     rule = chosen_rule(config)
-    if rule.delivers != "gradient":
+    if not isinstance(rule, Rule):
         return 1.0
     pull = identity = 0.0
     for t in chosen_schedule(config, rule).rest(prior.alphas_cumprod):

@@ -12,9 +12,9 @@ from dreamcatalyst.diffusion.closed_form import ClosedForm, ClosedFormConfig
 from dreamcatalyst.diffusion.combine import Branch, predict_difference
 from dreamcatalyst.diffusion.noise import add_noise, keyed_noise, stable_diffusion_schedule
 from dreamcatalyst.errors import ConfigError, NumericalError, PriorError
+from dreamcatalyst.guidance.ddim import denoise, sample_rule
 from dreamcatalyst.guidance.distill import distillation_gradient
-from dreamcatalyst.guidance.replace import denoise, sample_rule
-from dreamcatalyst.guidance.rules import RULES, get_rule, pds_coefficients, pds_coefficients_from_betas
+from dreamcatalyst.guidance.rules import get_rule, gradient_rules, pds_coefficients, pds_coefficients_from_betas
 from torch import Tensor
 
 from .cases import Case, Check, compare, refused, worst
@@ -22,7 +22,7 @@ from .cases import Case, Check, compare, refused, worst
 ABAR = stable_diffusion_schedule()
 T = len(ABAR)
 SHAPE = (1, 3, 5, 4)
-GRADIENT_RULES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
+GRADIENT_RULES = gradient_rules()
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 

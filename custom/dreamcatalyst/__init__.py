@@ -13,8 +13,8 @@ OFFERS = {
     "dreamcatalyst-edit-system": ".train.edit",
     "dreamcatalyst-prior-data": ".train.prior.data",
     "dreamcatalyst-prior-system": ".train.prior.system",
-    "dreamcatalyst-guidance": ".guidance.host",
-    "dreamcatalyst-edit-guidance": ".guidance.host",
+    "dreamcatalyst-guidance": ".host.guidance",
+    "dreamcatalyst-edit-guidance": ".host.guidance",
 }
 
 plugin.offer(OFFERS, __name__)

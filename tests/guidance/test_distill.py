@@ -129,11 +129,6 @@ def test_sds_runs_without_a_source(world):
     assert torch.equal(gradient(world, world.prior, get_rule("sds"), x_src=None), with_source)
 
 
-def test_rules_that_deliver_images_give_no_gradient(world):
-    with pytest.raises(ConfigError, match="in2n"):
-        gradient(world, world.prior, get_rule("in2n"))
-
-
 @pytest.mark.parametrize("name", ["dreamcatalyst", "csd-like", "in2n"])
 def test_rules_of_the_image_row_refuse_text_to_image_priors(world, name):
     world.prior.takes_image = False

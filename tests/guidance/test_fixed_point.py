@@ -8,10 +8,10 @@ from dreamcatalyst.diffusion.closed_form import ClosedForm, ClosedFormConfig
 from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.guidance.distill import distillation_gradient
 from dreamcatalyst.guidance.fixed_point import balanced, contraction, fixed_point, mean_gradient
-from dreamcatalyst.guidance.rules import RULES, get_rule
+from dreamcatalyst.guidance.rules import get_rule, gradient_rules
 from dreamcatalyst.guidance.timesteps import Schedule
 
-GRADIENT_RULES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
+GRADIENT_RULES = gradient_rules()
 SCALES = [(7.5, 1.5), (3.0, 1.0), (1.0, 1.0), (5.0, 2.5)]
 every_rule = pytest.mark.parametrize("name", GRADIENT_RULES)
 every_scale = pytest.mark.parametrize("scales", SCALES)

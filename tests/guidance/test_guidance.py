@@ -6,11 +6,12 @@ import pytest
 import torch
 from dreamcatalyst.diffusion.closed_form import ClosedForm
 from dreamcatalyst.errors import ConfigError, DreamCatalystError, PriorError
+from dreamcatalyst.guidance.config import GuidanceConfig
 from dreamcatalyst.guidance.distill import distillation_gradient
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
-from dreamcatalyst.guidance.rules import RULES, get_rule
+from dreamcatalyst.guidance.guidance import Guidance
+from dreamcatalyst.guidance.rules import RULES, get_rule, gradient_rules
 
-GRADIENT_RULES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
+GRADIENT_RULES = gradient_rules()
 
 
 def guidance(prompt: str = "Make it sunset", source_prompt: str = "", **options) -> Guidance:
@@ -57,7 +58,7 @@ def test_loss_carries_the_rules_gradient_through_the_encoder():
         image=made.prior.condition(sources.permute(0, 3, 1, 2)),
         text=made.text,
         timestep=made.schedule.timestep(30, 100, made.prior.alphas_cumprod),
-        noise=made._noise(x, [4, 9], 30),
+        noise=made.noise(x, [4, 9], 30),
     )
     torch.testing.assert_close(got, 2.0 * g.permute(0, 2, 3, 1) / g.numel())
     torch.testing.assert_close(given.gradient, g)
@@ -110,33 +111,33 @@ def test_the_expected_picture_is_where_the_mean_gradient_vanishes(name):
     """Of the timesteps that the rule rests under; two opposite draws of noise have exactly the mean."""
     made = guidance(rule=name, prior={"s": 0.2, "s_image": 3.0, "s_null": 0.8, "mu": 0.1}, guidance_scale=1.2)
     source = 0.4 + 0.2 * pictures(1)[0].double()
-    expected = made.expected(source, 0)
+    expected = made.objective.expected(source, 0)
     assert expected.min() > 0.0 and expected.max() < 1.0  # nothing was clamped, or it would not vanish
     x, x_src = (made.prior.encode(image.permute(2, 0, 1)[None]) for image in (expected, source))
     total = torch.zeros_like(x)
-    for t in made.resting_timesteps:
+    for t in made.objective.resting_timesteps:
         for sign in (1.0, -1.0):
             total += distillation_gradient(
                 made.prior,
                 made.rule,
                 x,
                 x_src,
-                image=made.view(source, 0)[1],
+                image=made.encode_source(source, 0)[1],
                 text=made.text,
                 timestep=t,
                 noise=sign * torch.ones_like(x),
                 guidance_scale=1.2,
                 image_guidance_scale=1.5,
             )
-    assert total.abs().max() / len(made.resting_timesteps) < 1e-10
+    assert total.abs().max() / len(made.objective.resting_timesteps) < 1e-10
 
 
 def test_by_default_the_expected_picture_is_the_edit():
     source = pictures(1)[0].double()
     for name in ("dreamcatalyst", "pds", "csd-like"):
         made = guidance(rule=name)
-        torch.testing.assert_close(made.expected(source, 0), made.known_edit(source, 0))
-    assert not torch.allclose(made.expected(source, 0, timestep=901), made.known_edit(source, 0))
+        torch.testing.assert_close(made.objective.expected(source, 0), made.known_edit(source, 0))
+    assert not torch.allclose(made.objective.expected(source, 0, timestep=901), made.known_edit(source, 0))
 
 
 def test_a_source_text_is_taken_off_the_edit():
@@ -144,7 +145,7 @@ def test_a_source_text_is_taken_off_the_edit():
     source = 0.45 + 0.1 * pictures(1)[0].double()
     made = guidance("Make it sepia", "Make it night", rule="pds")
     sepia, night = (guidance(prompt).known_edit(source, 0) for prompt in ("Make it sepia", "Make it night"))
-    torch.testing.assert_close(made.expected(source, 0), (source + sepia - night).clamp(0, 1))
+    torch.testing.assert_close(made.objective.expected(source, 0), (source + sepia - night).clamp(0, 1))
     assert guidance(rule="dreamcatalyst", source_prompt="a photo of a man").source_text is None
     with pytest.raises(PriorError, match="a photo of a man"):
         guidance(rule="dds", source_prompt="a photo of a man")
@@ -153,11 +154,11 @@ def test_a_source_text_is_taken_off_the_edit():
 def test_nothing_is_expected_where_nothing_attracts_or_nothing_is_known(monkeypatch):
     source = pictures(1)[0]
     unstable = guidance(prior={"s": 0.4, "s_image": 0.05})
-    assert unstable.expected(source, 0) is None and unstable.known_edit(source, 0) is not None
-    assert guidance(rule="known-edit").expected(source, 0) is None
+    assert unstable.objective.expected(source, 0) is None and unstable.known_edit(source, 0) is not None
+    assert guidance(rule="known-edit").objective.expected(source, 0) is None
     made = guidance()
     monkeypatch.setattr(ClosedForm, "exact", False)
-    assert made.expected(source, 0) is None and made.known_edit(source, 0) is None
+    assert made.objective.expected(source, 0) is None and made.known_edit(source, 0) is None
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0, 7.5])

@@ -7,9 +7,10 @@ import torch
 from dreamcatalyst.diffusion.closed_form import ClosedForm
 from dreamcatalyst.diffusion.noise import keyed_noise
 from dreamcatalyst.errors import ConfigError, PriorError
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.ddim import edit_image
 from dreamcatalyst.guidance.edited_views import EditedViews
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
-from dreamcatalyst.guidance.replace import edit_image
+from dreamcatalyst.guidance.guidance import Guidance
 
 SIZE = 8
 
@@ -31,8 +32,8 @@ def visit(made: Guidance, view: int, step: int, render: torch.Tensor | None = No
 
 def test_a_view_is_edited_at_its_first_visit_and_at_multiples_of_per_editing_step(monkeypatch):
     made, edits = guidance(per_editing_step=10), []
-    edit = made.edit
-    monkeypatch.setattr(made, "edit", lambda *args: (edits.append(args[2:]), edit(*args))[1])
+    edit = made.objective.picture
+    monkeypatch.setattr(made.objective, "picture", lambda *args: (edits.append(args[2:]), edit(*args))[1])
     for step, view in [(3, 0), (4, 0), (5, 1), (10, 0), (11, 1), (20, 1), (21, 0)]:
         visit(made, view, step)
     assert edits == [(0, 3), (1, 5), (0, 10), (1, 20)]
@@ -56,7 +57,7 @@ def test_later_edits_take_place_between_two_steps():
 def test_the_loss_is_the_mean_absolute_difference_from_the_kept_edit():
     made = guidance()
     visit(made, 0, 1)
-    target, rgb = made.edits.get(0, like=picture(0)), picture(7)
+    target, rgb = made.objective.edited.get(0, like=picture(0)), picture(7)
     given = made.step(rgb[None], picture(0)[None], [0], 2, 100)
     torch.testing.assert_close(given.loss, (rgb - target).abs().mean())
     torch.testing.assert_close(visit(made, 0, 2, rgb.clone()), torch.sign(rgb - target) / rgb.numel())
@@ -65,7 +66,7 @@ def test_the_loss_is_the_mean_absolute_difference_from_the_kept_edit():
 def test_the_edit_is_a_denoising_run_of_the_noised_render_conditioned_on_the_source():
     made = guidance()
     render, source = picture(50), picture(3)
-    got = made.edit(render, source, 3, 17)
+    got = made.objective.picture(render, source, 3, 17)
     prior = made.prior
     latents, condition = prior.encode(render.permute(2, 0, 1)[None]), prior.condition(source.permute(2, 0, 1)[None])
     wanted = edit_image(
@@ -74,7 +75,7 @@ def test_the_edit_is_a_denoising_run_of_the_noised_render_conditioned_on_the_sou
         keyed_noise(0, 17, 3, latents.shape[1:])[None],
         image=condition,
         text=prior.embed(["Make it sunset"])[0],
-        timestep=made.edits.timestep(3, 17, 1000),
+        timestep=made.objective.edited.timestep(3, 17, 1000),
         steps=4,
     )
     assert torch.equal(got, prior.decode(wanted)[0].permute(1, 2, 0))

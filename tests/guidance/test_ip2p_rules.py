@@ -8,7 +8,8 @@ import math
 import pytest
 import torch
 from dreamcatalyst.diffusion.noise import keyed_noise
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.guidance import Guidance
 
 from tests.diffusion.small_model import make_model
 
@@ -23,7 +24,7 @@ def folder(tmp_path_factory):
 
 def test_independent_latents_are_drawn_anew_at_every_step_source_and_edit_apart(folder, monkeypatch):
     """As the published codes draw them; a function of seed, step and view, so that a resumed run draws the same."""
-    from dreamcatalyst.guidance import guidance as module
+    from dreamcatalyst.guidance import distillation as module
 
     prior = {"path": str(folder), "latents": "independent"}
     made = Guidance(GuidanceConfig(prior_type="ip2p", prior=prior, seed=SEED), PROMPT)

@@ -1,7 +1,8 @@
 """Antithetic noise on the exact prior, whose gradient is affine in the noise."""
 
 import torch
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.guidance import Guidance
 
 
 def gradient(kind: str, step: int = 3, visit: int = 0) -> torch.Tensor:
@@ -14,7 +15,7 @@ def gradient(kind: str, step: int = 3, visit: int = 0) -> torch.Tensor:
 def mean_gradient() -> torch.Tensor:
     """Over many independent draws is slow; the noise-free one comes from drawing none."""
     guidance = Guidance(GuidanceConfig(), "Make it night")
-    guidance._noise = lambda latents, index, step: torch.zeros_like(latents)
+    guidance.noise = lambda latents, index, step: torch.zeros_like(latents)
     generator = torch.Generator().manual_seed(0)
     render, source = (torch.rand(1, 6, 5, 3, dtype=torch.float64, generator=generator) for _ in range(2))
     return guidance.step(render, source, [7], 3, 10).gradient

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from dreamcatalyst.diffusion.api import PRIORS
 from dreamcatalyst.diffusion.closed_form import ClosedForm, ClosedFormConfig, noise_slope
+from dreamcatalyst.guidance.config import NOISES
 from dreamcatalyst.guidance.fixed_point import balanced, contraction, fixed_point, mean_gradient
-from dreamcatalyst.guidance.guidance import NOISES
-from dreamcatalyst.guidance.rules import RULES, get_rule
+from dreamcatalyst.guidance.rules import RULES, get_rule, gradient_rules
 from dreamcatalyst.guidance.timesteps import POLICIES, Schedule
 from dreamcatalyst.render.api import BACKENDS
 from dreamcatalyst.scene.generations import ANCHORS
@@ -18,7 +18,7 @@ from dreamcatalyst.segment.api import SEGMENTERS
 from dreamcatalyst.train.density import DENSITY
 
 ROOT = Path(__file__).resolve().parents[2]
-GRADIENT_RULES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
+GRADIENT_RULES = gradient_rules()
 SPREADS = {
     "dreamcatalyst": (5.08, 1),
     "dreamcatalyst-psi2": (6.36, 1),

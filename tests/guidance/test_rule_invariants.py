@@ -10,11 +10,11 @@ import torch
 from dreamcatalyst.diffusion.closed_form import ClosedForm, ClosedFormConfig
 from dreamcatalyst.diffusion.noise import keyed_noise
 from dreamcatalyst.guidance.distill import distillation_gradient, distillation_loss
-from dreamcatalyst.guidance.rules import EDIT_NULL, NOISE, RULES, SOURCE, SOURCE_NULL, get_rule
+from dreamcatalyst.guidance.rules import EDIT_NULL, NOISE, SOURCE, SOURCE_NULL, get_rule, gradient_rules
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-RULE_NAMES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
+RULE_NAMES = gradient_rules()
 OF_TWO_TEXTS = [name for name in RULE_NAMES if get_rule(name).reference == SOURCE]
 OF_A_SOURCE = [name for name in RULE_NAMES if get_rule(name).reference in (SOURCE, SOURCE_NULL, EDIT_NULL)]
 few = settings(max_examples=15, deadline=None, derandomize=True)

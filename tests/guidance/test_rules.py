@@ -9,16 +9,19 @@ import torch
 from dreamcatalyst.diffusion.noise import stable_diffusion_schedule
 from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.guidance.distill import distillation_gradient
+from dreamcatalyst.guidance.objective import Objective
 from dreamcatalyst.guidance.rules import (
     PRESETS,
     RULES,
+    Rule,
     get_rule,
+    gradient_rules,
     noise_level,
     pds_coefficients,
     pds_coefficients_from_betas,
 )
 
-GRADIENT_RULES = [name for name in RULES.names() if get_rule(name).delivers == "gradient"]
+GRADIENT_RULES = gradient_rules()
 ABAR = stable_diffusion_schedule()
 W_Y, W_I = 7.5, 1.5
 
@@ -136,6 +139,9 @@ def test_csd_like_is_the_guidance_alone(world):
 def test_rows_are_complete(name):
     rule = get_rule(name)
     assert rule.name == name and rule.citation
+    if not isinstance(rule, Rule):
+        assert issubclass(rule.objective, Objective) and rule.objective.gives_pictures
+        return
     a, b = rule.weights(501, ABAR)
     assert math.isfinite(a) and math.isfinite(b) and a >= 0 and b >= 0
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from dreamcatalyst.data.camera import Cameras, look_at
 from dreamcatalyst.demo.shapes import disc, surface
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.guidance import Guidance
 from dreamcatalyst.render.api import rasterize
 from dreamcatalyst.scene.gaussians import Gaussians
 from dreamcatalyst.segment.api import MaskRequest

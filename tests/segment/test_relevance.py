@@ -9,7 +9,8 @@ import torch
 from dreamcatalyst.config import parse
 from dreamcatalyst.diffusion.closed_form import noise_slope
 from dreamcatalyst.errors import ConfigError, PriorError
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.guidance import Guidance
 from dreamcatalyst.segment.api import MaskConfig, make_mask
 from dreamcatalyst.segment.relevance import Answer, Relevance, normalised
 

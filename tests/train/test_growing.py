@@ -6,7 +6,8 @@ import pytest
 import torch
 from dreamcatalyst.demo.edits import apply_edit
 from dreamcatalyst.demo.worlds import make_world
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.guidance import Guidance
 from dreamcatalyst.render.api import rasterize
 from dreamcatalyst.report.metrics import psnr
 from dreamcatalyst.scene.gaussians import PARAMETERS

@@ -11,7 +11,7 @@ from ..diffusion.api import Prior
 from ..diffusion.combine import Branch, difference_rows, predict_difference
 from ..diffusion.noise import abar_at, add_noise
 from ..errors import ConfigError, NumericalError, PriorError
-from .rules import EDIT_NULL, NOISE, SOURCE, SOURCE_NULL, Rule
+from .rules import EDIT_NULL, NOISE, SOURCE, SOURCE_NULL, Replacement, Rule
 
 
 @torch.no_grad()
@@ -36,8 +36,8 @@ def distillation_gradient(
     (source_text is used by dds and pds). timestep: index 0..T-1. noise: as x, the same for both branches.
     The result is float32, float64 where x is. Half-precision latents are noised in float32: at high noise all that x
     and x_src differ by is below the last digit of a half-precision x_t.
-    A step with a(t) = 0 does not call the prior. Raises ConfigError where the rule lacks its source or gives no
-    gradient, PriorError where the prior cannot serve the rule, NumericalError where g is not finite.
+    A step with a(t) = 0 does not call the prior. Raises ConfigError where the rule lacks its source,
+    PriorError where the prior cannot serve the rule, NumericalError where g is not finite.
     """
     check_prior(rule, prior)
     a, b = rule.weights(timestep, prior.alphas_cumprod)
@@ -62,14 +62,10 @@ def distillation_gradient(
 def network_rows(
     prior: Prior, rule: Rule, text: Any, source_text: Any, guidance_scale: float, image_guidance_scale: float
 ) -> int:
-    """How many rows one step of the rule asks of the prior for each view (each step of an edit, for a rule that
-    delivers one)."""
-    if rule.delivers == "known edit":
-        return 0
+    """How many rows one step of the rule asks of the prior for each view."""
     latents, other = torch.zeros(1), torch.zeros(1)
     edit = Branch(latents, text, object(), guidance_scale, image_guidance_scale)
-    gradient = rule.delivers == "gradient"
-    reference = _reference(rule, edit, other, torch.zeros(1), 0.5, source_text) if gradient else None
+    reference = _reference(rule, edit, other, torch.zeros(1), 0.5, source_text)
     return len(difference_rows(edit, reference, prior.takes_image))
 
 
@@ -101,7 +97,7 @@ def distillation_loss(x: Tensor, gradient: Tensor, reduction: str = "mean") -> T
     raise ConfigError(f"system.guidance.reduction: unknown reduction '{reduction}'. Known: mean, sum.")
 
 
-def check_prior(rule: Rule, prior: Prior) -> None:
+def check_prior(rule: Rule | Replacement, prior: Prior) -> None:
     """Raise PriorError where `prior` cannot serve `rule`: cheap, to be asked before any long work."""
     if rule.needs_image and not prior.takes_image:
         raise PriorError(
@@ -111,8 +107,6 @@ def check_prior(rule: Rule, prior: Prior) -> None:
 
 
 def _check_latents(rule: Rule, x: Tensor, x_src: Tensor | None, noise: Tensor, b: float) -> None:
-    if rule.delivers != "gradient":
-        raise ConfigError(f"rule '{rule.name}' delivers an {rule.delivers}, not a gradient: see guidance/replace.py")
     if x_src is None and (b != 0.0 or rule.reference in (SOURCE, SOURCE_NULL)):
         raise ConfigError(f"rule '{rule.name}' needs the latents of the source render and got none")
     for name, other in (("x_src", x_src), ("noise", noise)):

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ..diffusion.noise import keyed_generator
-from ..errors import ConfigError
 
 
 class EditedViews:
@@ -25,18 +24,6 @@ class EditedViews:
     def __init__(
         self, every: int, lowest: float, highest: float, seed: int = 0, begin: int = 0, until: int | None = None
     ):
-        if every < 0:
-            raise ConfigError(f"system.guidance.per_editing_step: got {every}, expected 0 (first visits only) or more")
-        if not 0.0 <= lowest <= highest < 1.0:
-            raise ConfigError(
-                f"system.guidance: edit_min_percent {lowest} and edit_max_percent {highest} must be fractions with "
-                "0 <= min <= max < 1"
-            )
-        if begin < 0 or (until is not None and until < begin):
-            raise ConfigError(
-                f"system.guidance: edit_begin_step {begin} and edit_until_step {until} must be steps with "
-                "0 <= begin <= until, or until null"
-            )
         self.every, self.limits, self.seed = every, (lowest, highest), seed
         self.begin, self.until = begin, until
         self._images: dict[int, Tensor] = {}

@@ -58,7 +58,7 @@ def fixed_point(
 def contraction(
     prior: ClosedForm, rule: Rule, timestep: int, guidance_scale: float, image_guidance_scale: float
 ) -> float:
-    """The factor by which one step of replace.sample_rule multiplies the distance from the fixed point: it shrinks
+    """The factor by which one step of ddim.sample_rule multiplies the distance from the fixed point: it shrinks
     within -1..1 only."""
     abar = signal_at(prior.alphas_cumprod, timestep)
     a, _ = rule.weights(timestep, prior.alphas_cumprod)
@@ -69,7 +69,7 @@ def contraction(
 def check_sampler(
     prior: ClosedForm, rule: Rule, timesteps: Sequence[int], guidance_scale: float, image_guidance_scale: float
 ) -> None:
-    """Raise ConfigError where the steps of replace.sample_rule along `timesteps` lead away from the edit: where what
+    """Raise ConfigError where the steps of ddim.sample_rule along `timesteps` lead away from the edit: where what
     is off at one of them comes out of the ones after it larger than it was."""
     worst, left = 0.0, 1.0
     for t in reversed(timesteps):
@@ -94,7 +94,7 @@ def balanced(
     only as v grows without limit, and gets WIDE; so does one whose scale leaves nothing to balance (w_y <= 1).
     Raises ConfigError where the identity term is too strong for any spread, and at a timestep without noise.
     """
-    if prior.config.s_image is not None or prior.config.s_null is not None:
+    if _given(prior):
         return prior
     surplus = guidance_scale if rule.reference == EDIT_NULL else guidance_scale - 1.0
     abars = [abar_at(prior.alphas_cumprod, t) for t in timesteps]
@@ -120,3 +120,12 @@ def balanced(
     while low < (middle := 0.5 * (low + high)) < high:  # to the last bit
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
     return prior.with_spread(high)
+
+
+def with_wide_spread(prior: ClosedForm) -> ClosedForm:
+    """The prior with the spread of a rule without identity term, WIDE; as it is where a spread is given."""
+    return prior if _given(prior) else prior.with_spread(WIDE)
+
+
+def _given(prior: ClosedForm) -> bool:
+    return prior.config.s_image is not None or prior.config.s_null is not None

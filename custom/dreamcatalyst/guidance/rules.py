@@ -1,7 +1,8 @@
 """Every score-distillation rule as one row of a table.
 
 The gradient on the latents is g = a(t) (eps_edit - eps_ref) + b(t) (x - x_src), with no gradient through the network.
-A new rule is a new row here; nothing else names it.
+A new rule is one row more, here or in a file of one's own that a run's config imports: `RULES.add(name, Rule(...))`.
+What delivers pictures in the place of a gradient is a `Replacement` in the same registry.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -131,10 +133,9 @@ def _pds_psi(p: Parameters, t: int, abar: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Rule:
-    """One row: the weights a(t) and b(t), what eps_ref is, the timestep policy, and what the rule delivers.
+    """One row: the weights a(t) and b(t), what eps_ref is, and the timestep policy.
 
-    a: on eps_edit - eps_ref. b: on x - x_src. timesteps: default policy (timesteps.py). delivers: "gradient" on the
-    latents, or an image to come to: the prior's "edit" of the render, or the "known edit" of an exact one.
+    a: on eps_edit - eps_ref. b: on x - x_src. timesteps: default policy (timesteps.py).
     needs_image: it is defined by an image condition, which a text-to-image prior has not.
     """
 
@@ -144,9 +145,18 @@ class Rule:
     reference: str
     timesteps: str
     citation: str
-    delivers: str = "gradient"
     needs_image: bool = False
     parameters: Parameters = field(default_factory=Parameters)
+
+    @property
+    def reads_source_text(self) -> bool:
+        """Whether eps_ref is conditioned on a description of the source."""
+        return self.reference == SOURCE
+
+    @property
+    def needs_source(self) -> bool:
+        """Whether it compares with the source's latents, or with no noise that is known."""
+        return self.reference != NOISE
 
     def weights(self, timestep: int, alphas_cumprod: Tensor) -> tuple[float, float]:
         """(a, b) at index `timestep` of a prior with this schedule.
@@ -157,6 +167,24 @@ class Rule:
         a, b = self.a(self.parameters, timestep, alphas_cumprod), self.b(self.parameters, timestep, alphas_cumprod)
         damping = 1.0 + self.parameters.implicit_step * b
         return a / damping, b / damping
+
+
+@dataclass(frozen=True)
+class Replacement:
+    """A row of the table beside `Rule`. objective(prompted, row): a `Comparison` (guidance/comparison.py).
+
+    needs_image: it is defined by an image condition, which a text-to-image prior has not. needs_exact: it takes a prior
+    that knows its edit.
+    """
+
+    name: str
+    objective: Callable[[Any, Replacement], Any]
+    citation: str
+    needs_image: bool = False
+    needs_exact: bool = False
+
+    reads_source_text = needs_source = False  # no class of ours compares with the source
+    timesteps = "uniform"  # how noise levels are drawn where nothing else is said
 
 
 # Equations are DreamCatalyst's, numbered by the labels of its LaTeX source.
@@ -171,26 +199,33 @@ _TABLE = (
     Rule(
         "csd-like", _psi1, _phi, EDIT_NULL, "decreasing", "the 3DGS code published with DreamCatalyst", needs_image=True
     ),
-    Rule("known-edit", _zero, _zero, NOISE, "uniform", "the edit itself, where the prior knows it", "known edit"),
-    Rule("in2n", _zero, _zero, NOISE, "uniform", "Instruct-NeRF2NeRF, Haque et al. 2023", "edit", needs_image=True),
 )
 
 RULES = Registry("guidance rule", __package__)
 for _row in _TABLE:
     RULES.add(_row.name, _row)
+RULES.add("in2n", ".comparison:IN2N")
+RULES.add("known-edit", ".comparison:KNOWN_EDIT")
 
 
-def get_rule(name: str, preset: str = "paper", **overrides: float) -> Rule:
+def gradient_rules() -> list[str]:
+    """The names of all rules that give a gradient, sorted."""
+    return [name for name in RULES.names() if isinstance(RULES.get(name), Rule)]
+
+
+def get_rule(name: str, preset: str = "paper", **overrides: float) -> Rule | Replacement:
     """The rule `name` with the parameters of `preset`, single ones replaced by `overrides` (chi, delta, gamma, gap,
     implicit_step).
 
     Raises ConfigError for an unknown rule, preset or parameter, naming the nearest, and for a negative step.
     """
-    rule: Rule = RULES.get(name, "system.guidance.rule")
+    rule: Rule | Replacement = RULES.get(name, "system.guidance.rule")
     parameters = PRESETS[choose("preset of rule parameters", preset, PRESETS, "system.guidance.preset")]
     known = [f.name for f in fields(Parameters)]
     for key in overrides:
         choose("rule parameter", key, known, "system.guidance")
     if not 0 <= overrides.get("implicit_step", 0.0) < math.inf:
         raise ConfigError(f"system.guidance.implicit_step: got {overrides['implicit_step']}, expected 0 or more.")
+    if not isinstance(rule, Rule):  # it has no weights that parameters could set
+        return rule
     return replace(rule, parameters=replace(parameters, **overrides))

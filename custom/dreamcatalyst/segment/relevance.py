@@ -113,7 +113,7 @@ class Relevance(Segmenter):
     def ask(self, guidance: Guidance, source: Tensor, view: int, draws: int) -> Answer:
         """How the prediction for a source render [H,W,3] differs with the instruction from without, over `draws` noise
         draws per level."""
-        prior, (latents, condition) = guidance.prior, guidance.view(source, view)
+        prior, (latents, condition) = guidance.prior, guidance.encode_source(source, view)
         shape, kind = latents.shape[1:], (latents.dtype, latents.device)
         size, last = max(self.draws, 2), len(prior.alphas_cumprod) - 1
         apart = []

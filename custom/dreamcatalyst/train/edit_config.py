@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ..config import Count, Fraction, NonNegative
 from ..errors import ConfigError, choose
-from ..guidance.guidance import GuidanceConfig
+from ..guidance.config import GuidanceConfig
 from ..loss.anchor import AnchorConfig
 from ..segment.api import MaskConfig
 from .density import DensifyConfig

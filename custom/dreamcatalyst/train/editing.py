@@ -16,7 +16,8 @@ from ..cache import ByteCache
 from ..data.camera import Cameras
 from ..data.truth import GroundTruth, normalised
 from ..errors import ConfigError, PriorError, SceneError, choose, nearest
-from ..guidance.guidance import Guidance, chosen_prior
+from ..guidance.config import chosen_prior
+from ..guidance.guidance import Guidance
 from ..loss.anchor import anchor_loss, anchor_step
 from ..loss.perceptual import Lpips
 from ..render.api import Render
@@ -90,7 +91,7 @@ class EditMethod(Method):
             self.guidance.stage = self.clock.stage
             warn_of_unknown(self.guidance.prior.instructions, words.prompt)
         if losses.lambda_perceptual and self.perceptual is None:
-            if self.guidance.rule.delivers == "gradient":
+            if not self.guidance.objective.gives_pictures:
                 raise ConfigError(
                     f"system.loss.lambda_perceptual: rule '{self.guidance.rule.name}' delivers no picture to compare "
                     "with. Set it to 0, or use the rule in2n."
@@ -151,7 +152,7 @@ class EditMethod(Method):
             masks = picture.parents[2] / "masks"  # of all runs of this name
             scene, state, editable = restrict_to_mask(self.part.mask, self.mask_request(scene), masks, picture)
             if editable is None:
-                self.guidance.forget_views()  # a mask is sought in clamped renders
+                self.guidance.forget_sources()  # a mask is sought in clamped renders
             else:
                 self.begin_at(scene, editable)
         splats = Splats(scene, state, editable)
@@ -180,7 +181,7 @@ class EditMethod(Method):
     def begin_at(self, scene: Gaussians, editable: Tensor) -> None:
         """Remember what a masked edit began with: bool [N], which splats of `scene` may change."""
         self.source.restrict(EditRegion(scene, editable, is_source=not self.cfg.original))
-        self.guidance.forget_views()
+        self.guidance.forget_sources()
 
     def begin_training(self) -> None:
         comments = [] if self.fitted is None else [self.fitted.comment]
@@ -232,7 +233,7 @@ class EditMethod(Method):
         numbers = {"t": guided.timestep, "residual": guided.gradient_rms}
         terms = {"guidance": losses.lambda_guidance * guided.loss}
         if share is not None and losses.lambda_outside:
-            leak = self.guidance.in_balance(((1 - share) * (render.rgb - sources)).abs().mean(), guided)
+            leak = self.guidance.objective.in_balance(((1 - share) * (render.rgb - sources)).abs().mean(), guided)
             terms["outside"], numbers["outside"] = losses.lambda_outside * leak, float(leak.detach())
         if self.perceptual is not None:
             distance = self.perceptual(shown, guided.target)
@@ -244,9 +245,7 @@ class EditMethod(Method):
         return terms, render, numbers
 
     def timestep(self, step: int) -> int | None:
-        if self.guidance.rule.delivers != "gradient":
-            return None
-        return self.guidance.schedule.timestep(step, self.context.max_steps(), self.guidance.prior.alphas_cumprod)
+        return self.guidance.objective.timestep(step, self.context.max_steps())
 
     @property
     def pulled(self) -> bool:
@@ -268,7 +267,7 @@ class EditMethod(Method):
         known = self.guidance.known_edit(source, index)
         if known is None:
             return {"source": source}
-        rest = self.guidance.expected(source, index)
+        rest = self.guidance.objective.expected(source, index)
         apart = rest is not None and not torch.allclose(rest, known, atol=1e-3)  # a balanced prior rests at its edit
         return {"edit": known, **({"fixed_point": rest} if apart else {}), "source": source}
 

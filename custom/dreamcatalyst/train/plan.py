@@ -12,7 +12,6 @@ from pathlib import Path
 
 from ..cache import tensor_bytes
 from ..files import write_text
-from ..guidance.distill import network_rows
 from ..guidance.guidance import Guidance
 from ..loss.anchor import AnchorConfig
 from ..loss.perceptual import WEIGHT_BYTES
@@ -150,13 +149,9 @@ class PlanBuilder:
 
     def prior(self, guidance: Guidance, batch: int) -> None:
         """The prior, and how often its network is asked in a step of `batch` views."""
-        rule, prior = guidance.rule, guidance.prior
-        self.add("prior", f"{guidance.config.prior_type}, rule {rule.name}", prior.weight_bytes)
-        rows = network_rows(prior, rule, guidance.text, guidance.source_text, *guidance.scales)
-        if rule.delivers == "gradient":
-            self.network_rows = rows * batch * (2 if guidance.config.noise == "paired" else 1)
-        elif rule.delivers == "edit":
-            self.picture_rows = rows * guidance.config.diffusion_steps
+        objective, name = guidance.objective, guidance.rule.name
+        self.add("prior", f"{guidance.config.prior_type}, rule {name}", guidance.prior.weight_bytes)
+        self.network_rows, self.picture_rows = objective.network_rows * batch, objective.picture_rows
 
     def mask(self, kind: str) -> None:
         """The one kind of mask, or none, and the others."""

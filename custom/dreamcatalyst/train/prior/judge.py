@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ...config import AtLeastOne, Count, DdimSteps, Number
 from ...diffusion.api import Prior
 from ...diffusion.noise import keyed_noise
-from ...guidance.replace import edit_image
+from ...guidance.ddim import edit_image
 from ...report.metrics import METRICS
 from ...report.pictures import picture_row
 from .data import Pairs

@@ -10,8 +10,8 @@ from dreamcatalyst.diffusion.closed_form import ClosedForm, ClosedFormConfig
 from dreamcatalyst.diffusion.combine import Branch, predict_difference
 from dreamcatalyst.diffusion.noise import add_noise, keyed_noise
 from dreamcatalyst.errors import ConfigError
+from dreamcatalyst.guidance.ddim import ddim_timesteps, edit_image, sample_rule
 from dreamcatalyst.guidance.fixed_point import contraction, fixed_point
-from dreamcatalyst.guidance.replace import ddim_timesteps, edit_image, sample_rule
 from dreamcatalyst.guidance.rules import get_rule
 
 

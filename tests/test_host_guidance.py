@@ -11,10 +11,11 @@ from dreamcatalyst import plugin
 from dreamcatalyst.diffusion.api import Row
 from dreamcatalyst.diffusion.noise import stable_diffusion_schedule
 from dreamcatalyst.errors import ConfigError, PriorError
-from dreamcatalyst.guidance.guidance import Guidance, GuidanceConfig
-from dreamcatalyst.guidance.host import content_key
-from dreamcatalyst.guidance.host_config import ALIASES, WITHOUT_EFFECT, HostConfig, prior_options
+from dreamcatalyst.guidance.config import GuidanceConfig
+from dreamcatalyst.guidance.guidance import Guidance
 from dreamcatalyst.guidance.timesteps import Schedule
+from dreamcatalyst.host.config import ALIASES, WITHOUT_EFFECT, HostConfig, prior_options
+from dreamcatalyst.host.guidance import content_key
 from omegaconf import OmegaConf
 
 from tests.diffusion.small_model import make_model
@@ -207,7 +208,7 @@ def test_a_sampler_that_diverges_is_refused_with_the_remedy_and_the_remedy_works
 def test_in2n_edits_the_render_and_known_edit_is_what_the_prior_knows():
     rgb, source = picture(seed=1), picture()
     ours = Guidance(GuidanceConfig(rule="in2n", diffusion_steps=3), WORDS)
-    wanted = ours.edit(rgb[0], source[0], content_key(source[0]), 6)
+    wanted = ours.objective.picture(rgb[0], source[0], content_key(source[0]), 6)
     guidance = made("edit-guidance", rule="in2n", diffusion_steps=3)
     guidance.update_step(0, 6)
     assert torch.equal(guidance(rgb, source, Processor())["edit_images"][0], wanted)

@@ -21,10 +21,9 @@ from .. import plugin
 from ..config import check, corners, parse
 from ..diffusion.noise import stable_diffusion_schedule
 from ..errors import ConfigError
-from .fixed_point import check_sampler
-from .guidance import Guidance, GuidanceConfig, chosen_rule, chosen_schedule
-from .host_config import WITHOUT_EFFECT, HostConfig, prior_options
-from .rules import NOISE, SOURCE
+from ..guidance.config import GuidanceConfig, chosen_rule, chosen_schedule
+from ..guidance.guidance import Guidance
+from .config import WITHOUT_EFFECT, HostConfig, prior_options
 
 LIMITS = ("min_step_percent", "max_step_percent")
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -140,7 +139,7 @@ class HostGuidance(plugin.BaseObject):
         given = next((a for a in args if isinstance(a, Tensor)), batch.get("gt_rgb"))
         if given is None and self._references and "index" in batch:
             given = self._reference(batch["index"])
-        if given is None and (self.rule.reference != NOISE or self._guidance.prior.takes_image):
+        if given is None and (self.rule.needs_source or self._guidance.prior.takes_image):
             raise ConfigError(
                 f"system.guidance: rule '{self.rule.name}' on prior {self.cfg.prior_type} needs the image that is "
                 "edited, and this system passes none. Use a data module that gives gt_rgb, such as "
@@ -182,7 +181,7 @@ class HostGuidance(plugin.BaseObject):
             return
         if not processors:
             raise ConfigError("system.guidance.prompt: is empty, and this system passes no prompt processor's output")
-        asked = processors[: 2 if self.rule.reference == SOURCE and not self.cfg.source_prompt else 1]
+        asked = processors[: 2 if self.rule.reads_source_text and not self.cfg.source_prompt else 1]
         if guidance.prior.exact:
             texts = guidance.prior.embed([processor.prompt for processor in asked])
         else:
@@ -255,9 +254,7 @@ class EditGuidance(HostGuidance):
 
     def configure(self) -> None:
         super().configure()
-        made = self._guidance
-        if made.prior.exact and self.rule.delivers == "gradient":
-            check_sampler(made.prior, self.rule, made.sampler_timesteps, *made.scales)
+        self._guidance.objective.check_sampler()
 
     def __call__(self, rgb: Tensor, *args: Any, **batch: Any) -> Answer:
         if "rgb_as_latents" in batch:  # only systems that want a loss say this, and would go on without any
@@ -272,5 +269,5 @@ class EditGuidance(HostGuidance):
     ) -> dict[str, Any]:
         if sources is None:
             raise ConfigError("system.guidance: an edit needs the image that is edited, and this system passes none")
-        edits = [guidance.edit_by_rule(*each, self._step) for each in zip(images, sources, views, strict=True)]
+        edits = [guidance.objective.picture(*each, self._step) for each in zip(images, sources, views, strict=True)]
         return {"edit_images": self._resized(torch.stack(edits), rgb.shape[1:3]).to(rgb)}

@@ -48,10 +48,10 @@ Limit = Annotated[Scalar, Range("[0, 1]")]
 class HostConfig:
     """A plain dataclass, since the host's are not frozen and may not inherit one that is."""
 
-    # --- GuidanceConfig's own keys (guidance/guidance.py), with other defaults where the host's differ
-    prior_type: str = "ip2p"  # ip2p | sd | closed-form
+    # --- GuidanceConfig's own keys (guidance/config.py), with other defaults where the host's differ
+    prior_type: str = "ip2p"  # a name in PRIORS (diffusion/api.py)
     prior: dict = field(default_factory=dict)  # the prior's own options
-    rule: str = "dreamcatalyst"  # a row of guidance/rules.py
+    rule: str = "dreamcatalyst"  # a name in RULES (guidance/rules.py)
     preset: str = "paper"  # chi, delta, gamma: paper | published-3dgs
     chi: NonNegative | None = None  # single ones replaced; null: the preset's
     delta: NonNegative | None = None

@@ -1,0 +1,36 @@
+"""Pictures that an exact prior knows beforehand: its edit, and where a rule comes to rest. docs/closed-form.md"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
+
+from .fixed_point import fixed_point
+from .prompted import PromptedPrior
+from .rules import Rule
+
+
+def known_edit(prompted: PromptedPrior, source: Tensor, index: int) -> Tensor | None:
+    """The edit that the prior knows of a view's source render, [H,W,3] in [0,1]; None for a prior that learned."""
+    return _edit(prompted, source, index, prompted.text) if prompted.prior.exact else None
+
+
+def resting_picture(
+    prompted: PromptedPrior, rule: Rule, source: Tensor, index: int, timesteps: Sequence[int]
+) -> Tensor | None:
+    """Where the rule's mean gradient over `timesteps` vanishes, [H,W,3], clamped to [0,1]; None where it is not known
+    or not stable."""
+    if not prompted.prior.exact:
+        return None
+    rest = fixed_point(prompted.prior, rule, timesteps, *prompted.scales)
+    if rest is None:
+        return None
+    edit = _edit(prompted, source, index, prompted.text) - _edit(prompted, source, index, prompted.source_text)
+    from_mean = source - (prompted.prior.config.mu + 1.0) / 2.0
+    return (source + rest.rho * edit + rest.drift * from_mean).clamp(0, 1)
+
+
+def _edit(prompted: PromptedPrior, source: Tensor, index: int, text: Any) -> Tensor:
+    return prompted.prior.known_edit(prompted.encode_source(source, index)[1], text)[0].permute(1, 2, 0)
