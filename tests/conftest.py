@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import jaxtyping
 import pytest
 
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
@@ -22,6 +23,11 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # read by torch when it is
 os.environ.setdefault("NUMBA_NUM_THREADS", str(max(2, THREADS)))  # two: tests show that their number changes no bit
 
 import torch  # noqa: E402
+
+
+from tests import shapes  # noqa: E402
+
+shapes.install()
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = ["data.width=24", "data.height=24", "system.report.video_frames=0", "trainer.accelerator=cpu"]
@@ -45,6 +51,14 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def unchecked():
+    """Without the check of annotations, as in a run: for tests of what functions themselves refuse."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @dataclass(frozen=True)

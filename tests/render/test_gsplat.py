@@ -4,7 +4,7 @@ machine that lacks something is told."""
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -97,7 +97,8 @@ RIGHT, WRONG = ("1.5.3", "1.5.3+pt24cu124", "1.5.9rc1"), ("1.4.0", "1.5.2", "1.6
 
 @pytest.mark.parametrize("version, right", [*((v, True) for v in RIGHT), *((v, False) for v in WRONG)])
 def test_versions_that_draw_otherwise_are_refused(monkeypatch, version, right):
-    package = SimpleNamespace(__version__=version)
+    package = ModuleType("gsplat")
+    package.__version__ = version
     monkeypatch.setitem(sys.modules, "gsplat", package)
     if right:
         assert gsplat.package() is package

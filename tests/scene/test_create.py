@@ -44,6 +44,7 @@ def test_points_that_coincide_keep_a_finite_scale():
     assert from_points(torch.zeros(6, 3), torch.zeros(6, 3)).log_scales.isfinite().all()
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_points_that_cannot_be_used():
     with pytest.raises(SceneError, match="empty"):
         from_points(torch.zeros(0, 3), torch.zeros(0, 3))

@@ -160,6 +160,7 @@ def test_splats_own_their_memory():
     assert scene.means[0, 0] == 0
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_what_does_not_fit_is_refused():
     splats = numbered(3)
     with pytest.raises(SceneError, match="'meens' is no per-splat tensor. Known: means"):
@@ -254,6 +255,7 @@ def test_children_inherit_the_share_of_the_update():
     assert splats.state["update"].tolist() == [1.0, 0.25, 0.5]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_masks_and_states_that_do_not_fit_are_refused():
     scene = numbered(3).scene
     with pytest.raises(SceneError, match=r"editable is torch.bool \(2,\), expected torch.bool \(3,\)"):

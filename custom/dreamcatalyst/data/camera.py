@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import DataError
@@ -19,8 +20,8 @@ class Cameras:
     width, height: pixels.
     """
 
-    viewmats: Tensor
-    Ks: Tensor
+    viewmats: Float[Tensor, "V 4 4"]
+    Ks: Float[Tensor, "V 3 3"]
     width: int
     height: int
 
@@ -45,13 +46,13 @@ class Cameras:
         return replace(self, viewmats=self.viewmats.to(device, dtype), Ks=self.Ks.to(device, dtype))
 
     @property
-    def centers(self) -> Tensor:
+    def centers(self) -> Float[Tensor, "V 3"]:
         """Camera centres in the world, [V,3] world units. The rotation part is taken as orthonormal."""
         rotation, translation = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
         return -(rotation.transpose(1, 2) @ translation[:, :, None])[:, :, 0]
 
     @property
-    def forward(self) -> Tensor:
+    def forward(self) -> Float[Tensor, "V 3"]:
         """Unit viewing directions in the world, [V,3]."""
         return self.viewmats[:, 2, :3]
 
@@ -78,7 +79,9 @@ class Cameras:
         return replace(parts[0], viewmats=torch.cat([c.viewmats for c in parts]), Ks=torch.cat([c.Ks for c in parts]))
 
 
-def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+def look_at(
+    eye: Float[Tensor, "V 3"], target: Float[Tensor, "*#V 3"], up: Float[Tensor, " 3"]
+) -> Float[Tensor, "V 4 4"]:
     """World-to-camera matrices [V,4,4] of cameras at `eye` [V,3] that look at `target` [V,3] or [3].
 
     up [3]: the world direction that is up in the image; where it is parallel to the view, another axis takes its place.

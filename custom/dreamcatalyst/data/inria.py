@@ -38,7 +38,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     return Scan([_shot(path, i, entry) for i, entry in enumerate(entries)], None, [])
 
 
-def _shot(path: Path, index: int, entry: dict) -> Shot:
+def _shot(path: Path, index: int, entry: object) -> Shot:
     if not isinstance(entry, dict):
         raise DataError(f"{path}: camera {index} is {entry!r}, expected an object with {', '.join(KEYS)}")
     missing = [key for key in KEYS if key not in entry]

@@ -76,7 +76,7 @@ def splats_from_capture(dataparser: str | Path, source: Path) -> Tensor:
     return torch.from_numpy(out)
 
 
-def _shot(path: Path, meta: dict, index: int, frame: dict) -> Shot:
+def _shot(path: Path, meta: dict, index: int, frame: object) -> Shot:
     where = f"{path}: frame {index}"
     if not isinstance(frame, dict):
         raise DataError(f"{where} is {type(frame).__name__}, expected an object with 'file_path', 'transform_matrix'")

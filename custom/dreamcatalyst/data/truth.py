@@ -13,6 +13,7 @@ from torch import Tensor
 from .camera import Cameras
 
 
+@runtime_checkable
 class SplatScene(Protocol):
     """What is asked of splats here (a Gaussians has it): means [N,3] and standard deviations [N,3], world units;
     opacities [N] in (0,1)."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..config import NonNegative
@@ -72,7 +73,7 @@ class AnchorConfig:
         )
 
 
-def _weights(splats: Splats, generations: Generations | None) -> Tensor | None:
+def _weights(splats: Splats, generations: Generations | None) -> Float[Tensor, " E"] | None:
     """The weight of each splat [E], None where none weighs anything (or there is none)."""
     if generations is None or not any(generations.weights):
         return None
@@ -80,7 +81,7 @@ def _weights(splats: Splats, generations: Generations | None) -> Tensor | None:
     return weights if bool(weights.any()) else None
 
 
-def anchor_loss(splats: Splats, generations: Generations | None, config: AnchorConfig) -> Tensor:
+def anchor_loss(splats: Splats, generations: Generations | None, config: AnchorConfig) -> Float[Tensor, ""]:
     """The pull as a loss: the sum over raw parameters a of lambda_a * mean(W[generation] * (a - anchor_a)^2), the means
     over editable splats and the parameter's channels. A scalar; differentiable in the splats' parameters.
 

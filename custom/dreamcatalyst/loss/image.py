@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # an 11 x 11 Gaussian window (Wang et al. 2004)
@@ -13,20 +14,20 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # for a data range of 1
 
 
 @lru_cache(maxsize=8)
-def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+def _window(dtype: torch.dtype, device: torch.device) -> Float[Tensor, " taps"]:
     x = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=torch.float64)
     w = torch.exp(-(x**2) / (2 * SSIM_SIGMA**2))
     return (w / w.sum()).to(device, dtype)
 
 
-def _blur(maps: Tensor) -> Tensor:
+def _blur(maps: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H W"]:
     """Separable Gaussian of [B,C,H,W] with zeros outside, as 3DGS does."""
     c, w = maps.shape[1], _window(maps.dtype, maps.device)
     rows = F.conv2d(maps, w.view(1, 1, 1, -1).expand(c, 1, 1, -1), padding=(0, SSIM_RADIUS), groups=c)
     return F.conv2d(rows, w.view(1, 1, -1, 1).expand(c, 1, -1, 1), padding=(SSIM_RADIUS, 0), groups=c)
 
 
-def ssim_map(a: Tensor, b: Tensor) -> Tensor:
+def ssim_map(a: Float[Tensor, "B H W C"], b: Float[Tensor, "B H W C"]) -> Float[Tensor, "B H W C"]:
     """Structural similarity at every pixel. a, b [B,H,W,3] in [0,1]; returns [B,H,W,3], at most 1.
 
     Source: Wang et al. 2004; window 11 x 11, sigma 1.5, zeros outside the image.
@@ -38,7 +39,9 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     return (top / ((mx * mx + my * my + SSIM_C1) * (vx + vy + SSIM_C2))).permute(0, 2, 3, 1)
 
 
-def photometric_loss(render: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def photometric_loss(
+    render: Float[Tensor, "B H W C"], target: Float[Tensor, "B H W C"], ssim_weight: float = 0.2
+) -> Float[Tensor, ""]:
     """(1 - w) L1 + w (1 - SSIM), a scalar. render, target [B,H,W,3]. Source: Kerbl et al. 2023, equation 7, w = 0.2."""
     l1 = (render - target).abs().mean()
     if ssim_weight == 0:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import ConfigError
@@ -35,7 +36,7 @@ def _find(folder: Path, patterns: tuple[str, ...], what: str, where: str) -> dic
     return torch.load(found[0], map_location="cpu", weights_only=True)
 
 
-def standardised(images: Tensor) -> Tensor:
+def standardised(images: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B 3 H W"]:
     """Images [B,H,W,3] in [0,1] as the network saw those of ImageNet: [B,3,H,W] of mean 0 and deviation 1."""
     shift, scale = (images.new_tensor(values).view(1, 3, 1, 1) for values in (SHIFT, SCALE))
     return (2 * images.permute(0, 3, 1, 2) - 1 - shift) / scale
@@ -72,7 +73,7 @@ class Lpips:
             )
         return weights[name].float()
 
-    def _features(self, images: Tensor) -> list[Tensor]:
+    def _features(self, images: Float[Tensor, "B H W 3"]) -> list[Float[Tensor, "B _ _ _"]]:
         x, features = standardised(images), []
         for number, block in enumerate(self.blocks):
             x = F.max_pool2d(x, 2) if number else x
@@ -81,7 +82,7 @@ class Lpips:
             features.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
         return features
 
-    def __call__(self, a: Tensor, b: Tensor) -> Tensor:
+    def __call__(self, a: Float[Tensor, "B H W 3"], b: Float[Tensor, "B H W 3"]) -> Float[Tensor, ""]:
         """Mean distance of images a, b [B,H,W,3] in [0,1], a scalar >= 0, differentiable in both; sides of 16 pixels
         and more (smaller ones are enlarged)."""
         if min(a.shape[1:3]) < SMALLEST:

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def total(terms: Mapping[str, Tensor]) -> Tensor:
+def total(terms: Mapping[str, Float[Tensor, ""]]) -> Float[Tensor, ""]:
     """The sum of the terms, a scalar."""
     return torch.stack([term.reshape(()) for term in terms.values()]).sum()
 
 
-def gradient_shares(terms: Mapping[str, Tensor], parameters: Mapping[str, Tensor]) -> dict[str, float]:
+def gradient_shares(
+    terms: Mapping[str, Float[Tensor, ""]], parameters: Mapping[str, Float[Tensor, ...]]
+) -> dict[str, float]:
     """The share of each term in the gradient, in [0,1], by its name; together 1, or all 0 where there is no gradient.
 
     Adam divides every group of parameters by its own size, so shares are taken group by group, |grad of the term| over
@@ -36,7 +39,9 @@ def gradient_shares(terms: Mapping[str, Tensor], parameters: Mapping[str, Tensor
 
 
 @torch.no_grad()
-def update_share(before: Sequence[Tensor], between: Sequence[Tensor], after: Sequence[Tensor]) -> float:
+def update_share(
+    before: Sequence[Float[Tensor, ...]], between: Sequence[Float[Tensor, ...]], after: Sequence[Float[Tensor, ...]]
+) -> float:
     """The share of a second step (between to after) in what it and a first one (before to between) move, in [0,1]: by
     their norms, parameter by parameter, averaged over those that move at all; 0 where none does."""
     first = torch.stack([(b - a).norm() for a, b in zip(before, between, strict=True)])

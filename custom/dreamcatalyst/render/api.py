@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from ..data.camera import Cameras
@@ -32,12 +33,12 @@ class Render:
     radii [V,N] int32 pixels, 0 where the splat is not drawn.
     """
 
-    rgb: Tensor
-    alpha: Tensor
-    depth: Tensor | None
-    features: Tensor | None
-    means2d: Tensor
-    radii: Tensor
+    rgb: Float[Tensor, "V H W 3"]
+    alpha: Float[Tensor, "V H W 1"]
+    depth: Float[Tensor, "V H W 1"] | None
+    features: Float[Tensor, "V H W F"] | None
+    means2d: Float[Tensor, "V N 2"]
+    radii: Int32[Tensor, "V N"]
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ def _check(scene: Gaussians, frozen: Gaussians) -> None:
             )
 
 
-def _tail(means2d: Tensor, first: int) -> Tensor:
+def _tail(means2d: Float[Tensor, "V N 2"], first: int) -> Float[Tensor, "V M 2"]:
     """The means2d of the splats from `first` on. A slice would lie beside the way from the loss to the parameters and
     see no gradient; this leaf is handed the part of it that arrives at the whole."""
     tail = means2d[:, first:].detach().requires_grad_(means2d.requires_grad)

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from .. import plugin
@@ -80,7 +81,7 @@ def arguments(
     )
 
 
-def turned(quats: Tensor) -> Tensor:
+def turned(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
     """Quaternions [N,4] of which none is zero, since gsplat's kernel divides by their norm: the identity instead,
     without gradient."""
     zero = torch.linalg.vector_norm(quats.detach(), dim=-1, keepdim=True) < SMALLEST_NORM

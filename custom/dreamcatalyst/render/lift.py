@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from ..data.camera import Cameras
 from ..errors import SceneError
 from ..scene.gaussians import Gaussians
 from .api import rasterize
+
+Masks = Shaped[Tensor, "V H W"] | Sequence[Shaped[Tensor, "H W"]]
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,8 @@ class Evidence:
     Of `vote`: sums of M and of 1, in pixels.
     """
 
-    inside: Tensor
-    total: Tensor
+    inside: Float[Tensor, " N"]
+    total: Float[Tensor, " N"]
 
     def __add__(self, other: Evidence) -> Evidence:
         return Evidence(self.inside + other.inside, self.total + other.total)
@@ -32,7 +35,7 @@ class Evidence:
 def lift(
     scene: Gaussians,
     cameras: Cameras,
-    masks: Tensor | Sequence[Tensor],
+    masks: Masks,
     *,
     backend: str = "auto",
     antialiased: bool = False,
@@ -60,7 +63,7 @@ def lift(
 
 
 def vote(
-    scene: Gaussians, cameras: Cameras, masks: Tensor | Sequence[Tensor], *, antialiased: bool = False
+    scene: Gaussians, cameras: Cameras, masks: Masks, *, antialiased: bool = False
 ) -> Evidence:
     """GaussianEditor's count as its code has it, for comparison: every splat that contributes to a pixel counts there
     with M and with 1, however little of it is seen.
@@ -78,7 +81,7 @@ def vote(
     return Evidence(*found.to(scene.means).unbind(dim=1))
 
 
-def _check(cameras: Cameras, masks: Tensor | Sequence[Tensor]) -> None:
+def _check(cameras: Cameras, masks: Masks) -> None:
     sizes = sorted({tuple(mask.shape) for mask in masks})
     size = (cameras.height, cameras.width)
     if len(masks) != len(cameras) or sizes != [size]:

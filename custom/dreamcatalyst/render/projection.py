@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from ..data.camera import Cameras
@@ -16,15 +17,15 @@ class Projected(NamedTuple):
     dets [V,N] px^4, their determinant; depths [V,N] camera z; compensation [V,N] = sqrt(det unblurred / det blurred);
     in_front [V,N] bool: not nearer than the near plane. Where it is false the other entries mean nothing."""
 
-    means2d: Tensor
-    covs2d: Tensor
-    dets: Tensor
-    depths: Tensor
-    compensation: Tensor
-    in_front: Tensor
+    means2d: Float[Tensor, "V N 2"]
+    covs2d: Float[Tensor, "V N 3"]
+    dets: Float[Tensor, "V N"]
+    depths: Float[Tensor, "V N"]
+    compensation: Float[Tensor, "V N"]
+    in_front: Bool[Tensor, "V N"]
 
 
-def rotations(quats: Tensor) -> Tensor:
+def rotations(quats: Float[Tensor, "*N 4"]) -> Float[Tensor, "*N 3 3"]:
     """Rotation matrices [...,3,3] of wxyz quaternions of any norm. They are divided by max(norm, 1e-12), so that a zero
     quaternion is the identity and its gradient is zero."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=1e-12).unbind(-1)
@@ -36,7 +37,9 @@ def rotations(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def project(means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras) -> Projected:
+def project(
+    means: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"], scales: Float[Tensor, "N 3"], cameras: Cameras
+) -> Projected:
     """Project means [N,3], quats [N,4] wxyz and scales [N,3] (world units) through V cameras.
 
     Source: Zwicker et al. 2001, EWA splatting: cov2d = J W Sigma W^T J^T + BLUR I, J the Jacobian of the perspective
@@ -66,7 +69,7 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras) -> P
     return Projected(means2d, covs2d, dets, depths, area / dets.sqrt(), in_front)
 
 
-def radii(splats: Projected, opacities: Tensor, cameras: Cameras) -> Tensor:
+def radii(splats: Projected, opacities: Float[Tensor, "V N"], cameras: Cameras) -> Int32[Tensor, "V N"]:
     """Half the longer side, in whole pixels, of the box outside of which a splat's alpha is below ALPHA_MIN: [V,N]
     int32, 0 where it is not drawn (behind the near plane, box outside of the image, opacity [V,N] below ALPHA_MIN)."""
     reach = (2 * (opacities / ALPHA_MIN).clamp_min(1.0).log())[..., None] * splats.covs2d[..., [0, 2]]

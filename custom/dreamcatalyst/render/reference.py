@@ -7,6 +7,7 @@ Memory and time grow with pixels times splats: for small images only.
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..data.camera import Cameras
@@ -61,7 +62,13 @@ def rasterize(
     )
 
 
-def blend(means2d: Tensor, covs2d: Tensor, dets: Tensor, opacities: Tensor, cameras: Cameras) -> Tensor:
+def blend(
+    means2d: Float[Tensor, "M 2"],
+    covs2d: Float[Tensor, "M 3"],
+    dets: Float[Tensor, " M"],
+    opacities: Float[Tensor, " M"],
+    cameras: Cameras,
+) -> Float[Tensor, "pixels M"]:
     """Weights alpha_i T_i [H*W,M] of M splats ordered front to back, T_i = prod_{j<i} (1 - alpha_j)."""
     x = torch.arange(cameras.width).to(means2d) + 0.5
     y = torch.arange(cameras.height).to(means2d) + 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..scene.gaussians import SH_C0
@@ -13,7 +14,7 @@ C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901
 # sqrt(35/32pi), sqrt(105/4pi), sqrt(21/32pi), sqrt(7/16pi), sqrt(105/16pi)
 
 
-def basis(dirs: Tensor, degree: int) -> Tensor:
+def basis(dirs: Float[Tensor, "*N 3"], degree: int) -> Float[Tensor, "*N K"]:
     """The (degree+1)^2 real SH at unit directions [...,3] -> [...,(degree+1)^2], orthonormal over the sphere.
 
     Order l = 0..degree, m = -l..l; odd m carry the Condon-Shortley sign, as in Kerbl et al. 2023.
@@ -32,7 +33,13 @@ def basis(dirs: Tensor, degree: int) -> Tensor:
     return torch.stack(out, dim=-1)
 
 
-def colors(means: Tensor, centers: Tensor, sh0: Tensor, shN: Tensor, degree: int) -> Tensor:
+def colors(
+    means: Float[Tensor, "N 3"],
+    centers: Float[Tensor, "V 3"],
+    sh0: Float[Tensor, "N 1 3"],
+    shN: Float[Tensor, "N K 3"],
+    degree: int,
+) -> Float[Tensor, "V N 3"]:
     """RGB [V,N,3] >= 0 of splats seen from camera centres: max(0, 0.5 + sum of basis * coefficient).
 
     means [N,3], centers [V,3] world units; sh0 [N,1,3]; shN [N,>=(degree+1)^2-1,3], bases above `degree` are left out.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import SceneError
@@ -14,7 +15,9 @@ from .gaussians import Gaussians
 GREY = 0.5  # the colour of a surface that has none
 
 
-def from_points(xyz: Tensor, rgb: Tensor, sh_degree: int = 3, initial_opacity: float = 0.1) -> Gaussians:
+def from_points(
+    xyz: Float[Tensor, "P 3"], rgb: Float[Tensor, "P 3"], sh_degree: int = 3, initial_opacity: float = 0.1
+) -> Gaussians:
     """Round splats at points, as 3DGS begins: scale = root mean square distance to the 3 nearest other points.
 
     xyz [P,3] world units, rgb [P,3] in [0,1]; float32 splats on the points' device. Points that coincide would get
@@ -40,7 +43,7 @@ def from_points(xyz: Tensor, rgb: Tensor, sh_degree: int = 3, initial_opacity: f
     )
 
 
-def neighbour_distance(xyz: np.ndarray, k: int = 3) -> np.ndarray:
+def neighbour_distance(xyz: Float[np.ndarray, "P 3"], k: int = 3) -> Float[np.ndarray, " P"]:
     """Root mean square distance [P] of each point to its `k` nearest others, or to all others; 0 for P = 1."""
     from scipy.spatial import cKDTree
 
@@ -70,7 +73,7 @@ def from_mesh(
         if not areas.sum() > 0:
             raise SceneError(f"{path}: its {sum(len(m.faces) for m in meshes)} faces have no area")
         counts = rng.multinomial(n, areas / areas.sum())
-        parts = [sample_surface(mesh, count, rng) for mesh, count in zip(meshes, counts, strict=True)]
+        parts = [sample_surface(mesh, count, rng) for mesh, count in zip(meshes, counts.tolist(), strict=True)]
     else:
         parts = [(np.asarray(cloud.vertices), _unit(cloud.colors, len(cloud.vertices))) for cloud in clouds]
     xyz, rgb = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -80,7 +83,7 @@ def from_mesh(
     return from_points(torch.from_numpy(xyz).float(), torch.from_numpy(rgb).float(), sh_degree, initial_opacity)
 
 
-def sample_surface(mesh, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def sample_surface(mesh, n: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """`n` points uniform over the area of a trimesh mesh, and their colours: xyz [n,3], rgb [n,3] in [0,1]."""
     faces = rng.choice(len(mesh.faces), n, p=mesh.area_faces / mesh.area)
     weights = rng.dirichlet((1.0, 1.0, 1.0), n)  # uniform over the triangle

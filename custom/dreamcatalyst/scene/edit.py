@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 from ..errors import SceneError
@@ -27,7 +28,7 @@ class Splats:
     """
 
     def __init__(
-        self, scene: Gaussians, state: Mapping[str, Tensor] | None = None, editable: Tensor | None = None
+        self, scene: Gaussians, state: Mapping[str, Tensor] | None = None, editable: Bool[Tensor, " N"] | None = None
     ) -> None:
         self.frozen: Gaussians | None = None
         if editable is not None:
@@ -87,7 +88,9 @@ class Splats:
                 value[rows] = torch.lerp(before[name], value[rows], weight)
 
     @torch.no_grad()
-    def rearrange(self, keep: Tensor, parents: Tensor, changed: Mapping[str, Tensor]) -> None:
+    def rearrange(
+        self, keep: Int[Tensor, " K"], parents: Int[Tensor, " M"], changed: Mapping[str, Shaped[Tensor, "M ..."]]
+    ) -> None:
         """Make the rows `keep` followed by one child for each of `parents`, everywhere at once.
 
         keep [K] and parents [M]: indices into the present (editable) rows. A child copies every parameter and state of
@@ -143,7 +146,7 @@ class Splats:
         return splats
 
 
-def _divide(scene: Gaussians, editable: Tensor) -> tuple[Gaussians, Gaussians | None]:
+def _divide(scene: Gaussians, editable: Bool[Tensor, " N"]) -> tuple[Gaussians, Gaussians | None]:
     """The editable part of a scene, and a plain copy of the rest, None where nothing is left of it."""
     if editable.dtype != torch.bool or editable.shape != (len(scene),):
         got = f"{editable.dtype} {tuple(editable.shape)}"

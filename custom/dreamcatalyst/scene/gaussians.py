@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 
 import torch
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from ..errors import SceneError
@@ -24,13 +25,13 @@ class Gaussians:
     Raises SceneError where the fields disagree in N, dtype or device.
     """
 
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    logit_opacities: Tensor
-    sh0: Tensor
-    shN: Tensor
-    extra: dict[str, Tensor] = field(default_factory=dict)
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    log_scales: Float[Tensor, "N 3"]
+    logit_opacities: Float[Tensor, " N"]
+    sh0: Float[Tensor, "N 1 3"]
+    shN: Float[Tensor, "N K 3"]
+    extra: dict[str, Shaped[Tensor, "N ..."]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
@@ -55,17 +56,17 @@ class Gaussians:
         return self.means.shape[0]
 
     @property
-    def scales(self) -> Tensor:
+    def scales(self) -> Float[Tensor, "N 3"]:
         """[N,3] world units."""
         return self.log_scales.exp()
 
     @property
-    def opacities(self) -> Tensor:
+    def opacities(self) -> Float[Tensor, " N"]:
         """[N] in (0,1)."""
         return self.logit_opacities.sigmoid()
 
     @property
-    def sh(self) -> Tensor:
+    def sh(self) -> Float[Tensor, "N K 3"]:
         """[N,(d+1)^2,3], a copy."""
         return torch.cat([self.sh0, self.shN], dim=1)
 
@@ -78,7 +79,7 @@ class Gaussians:
         """(name, tensor) of the six raw parameters, in the order of PARAMETERS."""
         return ((name, getattr(self, name)) for name in PARAMETERS)
 
-    def map(self, function) -> Gaussians:
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Apply `function` to every per-splat tensor, extras included."""
         done = {f.name: function(getattr(self, f.name)) for f in fields(self) if f.name != "extra"}
         return Gaussians(**done, extra={k: function(v) for k, v in self.extra.items()})
@@ -100,7 +101,7 @@ class Gaussians:
         """A copy that shares no memory."""
         return self.map(torch.Tensor.clone)
 
-    def with_extra(self, **extra: Tensor) -> Gaussians:
+    def with_extra(self, **extra: Shaped[Tensor, "N ..."]) -> Gaussians:
         """The same splats with these extras added or replaced."""
         return replace(self, extra={**self.extra, **extra})
 
@@ -115,11 +116,11 @@ class Gaussians:
 
     @staticmethod
     def from_colors(
-        means: Tensor,
-        scales: Tensor,
-        colors: Tensor,
-        opacities: Tensor,
-        quats: Tensor | None = None,
+        means: Float[Tensor, "N 3"],
+        scales: Float[Tensor, "N 3"],
+        colors: Float[Tensor, "N 3"],
+        opacities: Float[Tensor, " N"],
+        quats: Float[Tensor, "N 4"] | None = None,
         sh_degree: int = 0,
     ) -> Gaussians:
         """Splats of plain colours. scales [N,3] world units, colors [N,3] in [0,1], opacities [N] in (0,1)."""

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from ..errors import SceneError, choose
@@ -61,7 +62,9 @@ class Generations:
         splats.state[GENERATION] = torch.zeros(len(splats), dtype=torch.int64, device=splats.parameters["means"].device)
         self._anchor_here(splats)
 
-    def newborn(self, splats: Splats, parents: Tensor, changed: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def newborn(
+        self, splats: Splats, parents: Int[Tensor, " M"], changed: Mapping[str, Shaped[Tensor, "M ..."]]
+    ) -> dict[str, Shaped[Tensor, "M ..."]]:
         """What `Splats.rearrange` needs to know of children besides `changed`: their generation, and that each is
         anchored to its own parameters at birth, not to its parent's anchor. parents [M]: rows."""
         born = {
@@ -80,7 +83,7 @@ class Generations:
             self.weights[newest] = self.init
         self.weights.append(0.0)
 
-    def weight_of(self, splats: Splats) -> Tensor:
+    def weight_of(self, splats: Splats) -> Float[Tensor, " E"]:
         """The weight of each splat's generation, [E]."""
         return splats.parameters["means"].new_tensor(self.weights)[splats.state[GENERATION]]
 

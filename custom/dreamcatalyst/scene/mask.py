@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..errors import SceneError
@@ -15,8 +16,13 @@ FAINTEST = 1e-3  # the least update that a splat of a feathered mask gets: none 
 
 
 def soft_weights(
-    means: Tensor, inside: Tensor, total: Tensor, *, min_evidence: float = 0.5, neighbours: int = 8
-) -> Tensor:
+    means: Float[Tensor, "N 3"],
+    inside: Float[Tensor, " N"],
+    total: Float[Tensor, " N"],
+    *,
+    min_evidence: float = 0.5,
+    neighbours: int = 8,
+) -> Float[Tensor, " N"]:
     """inside / total [N] in [0,1] where at least `min_evidence` (pixels) of a splat is seen over all views.
 
     Splats of which less is seen are undecided, whatever their ratio: they take the mean weight of the `neighbours`
@@ -41,7 +47,7 @@ def soft_weights(
     return weights.clamp(0, 1)
 
 
-def threshold(weights: Tensor, level: float = 0.5) -> Tensor:
+def threshold(weights: Float[Tensor, " N"], level: float = 0.5) -> Bool[Tensor, " N"]:
     """Splats whose weight is at least `level`, bool [N]. Raises SceneError where there is none, which says what other
     levels would find."""
     mask = weights >= level
@@ -56,14 +62,14 @@ def threshold(weights: Tensor, level: float = 0.5) -> Tensor:
     return mask
 
 
-def invert(mask: Tensor) -> Tensor:
+def invert(mask: Bool[Tensor, " N"]) -> Bool[Tensor, " N"]:
     """Everything else, bool [N]. Raises SceneError where nothing else is left."""
     if bool(mask.all()):
         raise SceneError(f"mask: all {len(mask)} splats are in it, so that its inverse is empty. Set mask.invert=false")
     return ~mask
 
 
-def grow(means: Tensor, mask: Tensor, distance: float) -> Tensor:
+def grow(means: Float[Tensor, "N 3"], mask: Bool[Tensor, " N"], distance: float) -> Bool[Tensor, " N"]:
     """The mask and every splat whose centre is at most `distance` from a masked one, bool [N]. means [N,3]."""
     if distance <= 0 or not bool(mask.any()) or bool(mask.all()):
         return mask
@@ -73,7 +79,7 @@ def grow(means: Tensor, mask: Tensor, distance: float) -> Tensor:
     return grown
 
 
-def feather(means: Tensor, mask: Tensor, width: float) -> Tensor:
+def feather(means: Float[Tensor, "N 3"], mask: Bool[Tensor, " N"], width: float) -> Float[Tensor, " N"]:
     """How much of its update each splat takes, [N]: 0 outside of the mask, and in it in (0,1], rising with the distance
     to the nearest splat outside, to 1 at `width`. width 0, and a mask of all splats: 1 throughout the mask.
 
@@ -87,7 +93,9 @@ def feather(means: Tensor, mask: Tensor, width: float) -> Tensor:
     return update
 
 
-def _nearest(points: Tensor, queries: Tensor, k: int) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(
+    points: Float[Tensor, "P 3"], queries: Float[Tensor, "Q 3"], k: int
+) -> tuple[Float[np.ndarray, "Q k"], Int[np.ndarray, "Q k"]]:
     """Distances [Q,k] of `queries` [Q,3] to their k nearest `points` [P,3], and the numbers [Q,k] of those."""
     from scipy.spatial import cKDTree
 

@@ -1,0 +1,29 @@
+"""The package's annotations, shapes of tensors included, are checked whenever a test calls it; runs check nothing."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from beartype import BeartypeConf, beartype
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parent.parent / "custom"
+COMPILED = re.compile(r"^from numba import|^@njit|^@kernel", re.MULTILINE)  # numba cannot compile a checked function
+
+checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int may stand for a float
+
+
+def checked_modules() -> list[str]:
+    """The modules of the package, but those with kernels and the `__init__` files, whose names would stand for all."""
+    files = sorted(path for path in (ROOT / "dreamcatalyst").rglob("*.py") if path.name != "__init__.py")
+    return [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in files
+        if not COMPILED.search(path.read_text(encoding="utf-8"))
+    ]
+
+
+def install() -> None:
+    """From now on imported modules check each call. Must come before the package's first import."""
+    install_import_hook(checked_modules(), f"{__name__}.checked")
