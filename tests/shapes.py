@@ -1,4 +1,4 @@
-"""The package's annotations, shapes of tensors included, are checked whenever a test calls it; runs check nothing."""
+"""Annotations, shapes of tensors included, are checked whenever a test calls the package; runs check nothing."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from jaxtyping import install_import_hook
 ROOT = Path(__file__).resolve().parent.parent / "custom"
 COMPILED = re.compile(r"^from numba import|^@njit|^@kernel", re.MULTILINE)  # numba cannot compile a checked function
 
+FOLDERS = ("data", "scene", "render", "loss")  # those whose annotations hold
 checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int may stand for a float
 
 
 def checked_modules() -> list[str]:
-    """The modules of the package, but those with kernels and the `__init__` files, whose names would stand for all."""
-    files = sorted(path for path in (ROOT / "dreamcatalyst").rglob("*.py") if path.name != "__init__.py")
+    """The modules of FOLDERS, but those with kernels and the `__init__` files, whose names would stand for all."""
+    folders = [ROOT / "dreamcatalyst" / name for name in FOLDERS]
+    files = sorted(path for folder in folders for path in folder.rglob("*.py") if path.name != "__init__.py")
     return [
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for path in files

@@ -25,8 +25,9 @@ def test_a_wrong_shape_is_caught_where_it_is_handed_over():
 
 
 def test_all_but_kernels_is_checked():
-    package = ROOT / "custom" / "dreamcatalyst"
-    files = {".".join(path.relative_to(ROOT / "custom").with_suffix("").parts) for path in package.rglob("*.py")}
+    folders = [ROOT / "custom" / "dreamcatalyst" / name for name in shapes.FOLDERS]
+    paths = [path.relative_to(ROOT / "custom") for folder in folders for path in folder.rglob("*.py")]
+    files = {".".join(path.with_suffix("").parts) for path in paths}
     left_out = {name for name in files - set(shapes.checked_modules()) if not name.endswith("__init__")}
     assert all(name.startswith("dreamcatalyst.render.cpu") for name in left_out)
     assert "dreamcatalyst.render.api" in shapes.checked_modules()
