@@ -24,7 +24,6 @@ os.environ.setdefault("NUMBA_NUM_THREADS", str(max(2, THREADS)))  # two: tests s
 
 import torch  # noqa: E402
 
-
 from tests import shapes  # noqa: E402
 
 shapes.install()

@@ -23,7 +23,7 @@ def wall(x, depth=DEPTH, shift=0.0):
     red = (0.5 + 0.1 * along).expand(SIZE, SIZE)
     rgb = torch.stack([red, red * 0 + 0.3, red * 0 + shift], dim=-1)[None]
     full = torch.ones(1, SIZE, SIZE, 1)
-    return Render(rgb, full, depth * full, None, torch.zeros(1, 0, 2), torch.zeros(1, 0))
+    return Render(rgb, full, depth * full, None, torch.zeros(1, 0, 2), torch.zeros(1, 0, dtype=torch.int32))
 
 
 def test_a_pixel_s_point_lies_on_its_ray_at_its_depth():
