@@ -1,0 +1,1 @@
+"""Captures: photographs with their cameras, whatever format they came in."""

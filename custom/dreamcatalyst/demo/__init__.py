@@ -1,0 +1,1 @@
+"""Synthetic scenes, edits of them whose result is known, and the small diffusion model."""

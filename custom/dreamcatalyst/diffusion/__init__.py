@@ -1,0 +1,1 @@
+"""Priors: what diffusion models predict, and exact ones in closed form."""

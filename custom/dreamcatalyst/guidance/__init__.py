@@ -1,0 +1,1 @@
+"""Rules of score distillation as a table, timesteps, and the guidance that applies them."""

@@ -1,0 +1,1 @@
+"""One `rasterize`, several backends."""

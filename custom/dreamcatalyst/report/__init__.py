@@ -1,0 +1,1 @@
+"""Metrics, records, pictures and the page of a run: facts in, files out."""

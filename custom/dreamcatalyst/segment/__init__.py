@@ -1,0 +1,1 @@
+"""Masks: which splats an edit may change."""

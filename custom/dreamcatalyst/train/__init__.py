@@ -1,0 +1,1 @@
+"""Methods that fit and edit, density control, and the systems that run them."""
