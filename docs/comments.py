@@ -1,4 +1,4 @@
-"""A griffe extension: the comment behind a field is its documentation, and what stands in <> is no HTML."""
+"""A griffe extension: the comment behind a field is its documentation, and docstrings are plain text."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from griffe import Attribute, Docstring, Extension, Object
 
 BEHIND = re.compile(r"\S\s*  # (.*)$")
 BELOW = re.compile(r"^\s+# (.*)$")
-CODE_OR_TAG = re.compile(r"(`[^`]*`)|<")
+CODE_OR_MARK = re.compile(r"(`[^`]*`)|([<_*])")
 
 
 def readable(text: str) -> str:
-    """Markdown in which "<" outside of code is a character."""
-    return CODE_OR_TAG.sub(lambda found: found[1] or "&lt;", text)
+    """Markdown in which "<", "_" and "*" outside of code are characters."""
+    return CODE_OR_MARK.sub(lambda found: found[1] or f"&#{ord(found[2])};", text)
 
 
 class Comments(Extension):
