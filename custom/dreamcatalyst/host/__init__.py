@@ -1,0 +1,1 @@
+"""Guidances under the names and keys of threestudio, for its own systems."""
