@@ -2,8 +2,8 @@
 
 Every case is one entry of a table in benchmarks/faulty/. A case fails if there is a traceback, if something that was
 there is lost, if an error is due and none comes, if the line does not name what is to blame, or if it comes late.
-Almost all run in this process; kills, signals and full disks in processes of their own. Takes a few minutes; the exit
-status is 1 if one fails.
+Almost all run in this process, or in --jobs of them; kills, signals and full disks in processes of their own. Takes a
+few minutes; the exit status is 1 if one fails.
 
 python benchmarks/faults.py [--only words ...] [--write faults.md]
 """
@@ -11,13 +11,16 @@ python benchmarks/faults.py [--only words ...] [--write faults.md]
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
+import multiprocessing
 import os
 import re
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,9 +56,11 @@ Status 2 is an error of the user's, told in one line. Paths are relative to the 
 """
 
 
-def run(case: Case, root: Path, number: int) -> Outcome:
-    """Run a case in a folder of its own."""
-    return case.run(Place(root / f"{number:03d}", root / "things"))
+def run(index: int, number: int, root: Path) -> tuple[Outcome, list[str]]:
+    """Run a case in a folder of its own; what came, and what is wrong with it. What cases share is made by each process
+    for itself."""
+    outcome = CASES[index].run(Place(root / f"{number:03d}", root / f"things-{os.getpid()}"))
+    return outcome, CASES[index].faults(outcome)
 
 
 def brief(text: str, root: Path) -> str:
@@ -98,16 +103,21 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", metavar="WORD", help="cases whose group or name holds one of these words")
     parser.add_argument("--write", type=Path, metavar="MD", help="write the table there, too")
     parser.add_argument("--failed", action="store_true", help="print only the rows of cases that fail")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share the cases")
     args = parser.parse_args(argv)
-    chosen = [c for c in CASES if not args.only or any(word in f"{c.group}: {c.name}" for word in args.only)]
+    words = args.only or [""]
+    chosen = [i for i, c in enumerate(CASES) if any(word in f"{c.group}: {c.name}" for word in words)]
     head = "| what | given | what came | status | left on disk | verdict |\n|---|---|---|---:|---|---|"
     print(head)
     began, rows, failed = time.perf_counter(), [head], []
-    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
-        root = Path(folder).resolve()
-        for number, case in zip(itertools.count(1), chosen):
-            outcome = run(case, root, number)
-            faults = case.faults(outcome)
+    with contextlib.ExitStack() as stack:
+        root = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="faults-"))).resolve()
+        each = map
+        if args.jobs > 1:
+            context = multiprocessing.get_context("spawn")
+            each = stack.enter_context(ProcessPoolExecutor(args.jobs, context)).map
+        came = each(run, chosen, itertools.count(1), itertools.repeat(root))
+        for case, (outcome, faults) in zip((CASES[i] for i in chosen), came, strict=True):
             rows.append(row(case, outcome, faults, root))
             failed += [case.name] if faults else []
             if faults or not args.failed:
