@@ -58,8 +58,8 @@ MUTATIONS = [
     ),
     Mutation(
         "a kept mask with inside and outside swapped",
-        "torch.where(result.mask, inside, outside)",
-        "torch.where(result.mask, outside, inside)",
+        "mask, inside, outside)",
+        "mask, outside, inside)",
         ("test_confined",),
     ),
     Mutation(

@@ -37,8 +37,8 @@ def device(monkeypatch):
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory):
-    """A tenth of the made world's splats, as a PLY."""
-    return write_ply(tmp_path_factory.mktemp("splats") / "few.ply", make_world("statue").scene[::10])
+    """Some of the made world's splats, as a PLY."""
+    return write_ply(tmp_path_factory.mktemp("splats") / "few.ply", make_world("statue").scene[::40])
 
 
 @pytest.fixture
@@ -66,6 +66,7 @@ def run(models, few, tmp_path):  # noqa: F811
 
     def go(path):
         options = [f"system.gs_source={few}", f"exp_root_dir={tmp_path}", "trainer.fast_dev_run=true"]
+        options += ["data.width=32", "data.height=32", "data.max_view_num=2"]
         given = [*overrides(path, models, tmp_path), *options, "trainer.accelerator=cpu"]
         assert launcher.main(["--config", str(ROOT / path), *given]) == 0
         return tmp_path
@@ -99,7 +100,7 @@ def test_a_masked_edit_that_grows_on_a_device(seen, launch, few):  # noqa: F811
 
 
 def cameras_left_on_the_cpu(monkeypatch):
-    monkeypatch.setattr(Cameras, "to", lambda self, *_: self)
+    monkeypatch.setattr(Cameras, "to", lambda self, *_, **__: self)
 
 
 def a_network_left_on_the_cpu(monkeypatch):
