@@ -10,7 +10,6 @@ from dreamcatalyst.demo import pairs, photographs
 from dreamcatalyst.demo.edits import EDITS, find_edit
 from dreamcatalyst.demo.pairs import EDITS_PER_SOURCE, SEEN, VISIBLE, make_pairs, photograph_pairs, read_pairs
 from dreamcatalyst.demo.random_world import HELD_OUT
-from dreamcatalyst.demo.sheet import CAPTION, contact_sheet
 from dreamcatalyst.errors import ConfigError, DataError
 
 COUNT, SIZE = 30, 32
@@ -110,14 +109,6 @@ def test_photographs_come_with_their_packages():
         assert all(files.values())  # each says its licence
     images = photographs.load_photographs()
     assert len(images) == 6 and all(image.shape[2] == 3 and min(image.shape[:2]) >= 300 for image in images)
-
-
-def test_a_contact_sheet_shows_pairs_side_by_side(made):
-    sheet = contact_sheet(made, range(5), columns=2)
-    assert sheet.shape == (3 * (SIZE + CAPTION), 2 * 2 * SIZE, 3)
-    assert np.array_equal(sheet[:SIZE, :SIZE], made["source"][0])
-    assert np.array_equal(sheet[:SIZE, 3 * SIZE :], made["edited"][1])
-    assert (sheet[-(SIZE + CAPTION) :, 2 * SIZE :] == 255).all()  # the sixth place is empty
 
 
 GOOD = dict(

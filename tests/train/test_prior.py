@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 import torch
 from dreamcatalyst.config import parse
+from dreamcatalyst.demo.edits import EDITS
+from dreamcatalyst.diffusion.folder import SHIPPED
 from dreamcatalyst.diffusion.freeu import FreeU, FreeUConfig, freeu_sites
 from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig
 from dreamcatalyst.diffusion.noise import add_noise, stable_diffusion_schedule
@@ -17,7 +20,8 @@ from dreamcatalyst.train.prior.folder import write_prior
 from dreamcatalyst.train.prior.judge import sampled_edits, scores
 from dreamcatalyst.train.prior.losses import noised, reconstruction_loss
 from dreamcatalyst.train.prior.models import AutoencoderConfig, TextConfig, UnetConfig, make_networks
-from dreamcatalyst.train.prior.system import PriorSystem, Progress
+from dreamcatalyst.train.prior.stages import Progress
+from dreamcatalyst.train.prior.system import PriorSystem
 from dreamcatalyst.train.prior.vocabulary import WORD, learn_merges, vocabulary, write_tokenizer
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -92,6 +96,26 @@ def test_words_that_were_learned_are_single_tokens_and_others_decompose(tmp_path
         assert tokenizer(text).input_ids[0] == tokenizer.bos_token_id
         assert tokenizer(text).input_ids[-1] == tokenizer.eos_token_id
     assert tokenizer.tokenize("stated") != [] and tokenizer.unk_token not in tokenizer.tokenize("zebra, Äpfel 日本 42")
+
+
+def test_the_shipped_tokenizer_numbers_words_as_its_vocabulary_does():
+    """Its files are those that its weights were trained with: of instructions that it was taught, each word is one
+    token, and any other of the demo's edits comes out as pieces that spell it."""
+    from transformers import CLIPTokenizer
+
+    folder = SHIPPED / "tokenizer"
+    tokenizer, numbers = CLIPTokenizer.from_pretrained(folder), json.loads((folder / "vocab.json").read_text())
+    taught = {text for texts in json.loads((SHIPPED / "instructions.json").read_text()).values() for text in texts}
+    assert len(taught) > 300 and len(numbers) == 699
+    first, last = numbers["<|startoftext|>"], numbers["<|endoftext|>"]
+    for text in taught:
+        words = WORD.findall(text.lower())
+        assert tokenizer(text).input_ids == [first, *(numbers[f"{word}</w>"] for word in words), last]
+    for text in {phrase for edit in EDITS.values() for phrase in edit.phrases}:
+        pieces = tokenizer.convert_ids_to_tokens(tokenizer(text).input_ids[1:-1])
+        assert "".join(pieces).replace("</w>", " ").split() == WORD.findall(text.lower())
+    digest = hashlib.sha256(b"".join((folder / name).read_bytes() for name in ("vocab.json", "merges.txt"))).hexdigest()
+    assert digest == "ae47b6ff276d46292f24f2fd8affb247cc437edd5979977d78ff08085859c95f"
 
 
 @settings(max_examples=30, deadline=None)
@@ -215,6 +239,21 @@ def test_a_run_resumed_in_either_stage_has_the_bits_of_an_uninterrupted_one(trai
         assert torch.equal(one[name], other[name]), name
     assert list((whole / "save").glob("it3-autoencoder.png")) and list((whole / "save").glob("it6-*.png"))
     assert json.loads((whole / "save/prior/vae/config.json").read_text())["scaling_factor"] != 1
+
+
+def test_a_checkpoint_brings_its_own_vocabulary(train, monkeypatch):
+    """Versions of the vocabulary's training number words otherwise; what was trained goes on with its own numbers."""
+    from dreamcatalyst.train.prior import system
+
+    monkeypatch.setattr(system, "learn_merges", lambda texts: [*learn_merges(texts)[::-1], ("z", "z</w>")])
+    trial = train("checkpoint.every_n_train_steps=4", name="older")
+    (checkpoint,) = (trial / "ckpts").glob("*step=4.ckpt")
+    merges = (trial / "save/prior/tokenizer/merges.txt").read_text()
+    monkeypatch.undo()
+    resumed = train(f"resume={checkpoint}", name="older")
+    assert (resumed / "save/prior/tokenizer/merges.txt").read_text() == merges and "z z</w>" in merges
+    one, other = weights(trial), weights(resumed)
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_what_is_done_is_not_done_again(train, monkeypatch, pairs):

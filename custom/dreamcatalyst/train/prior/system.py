@@ -8,10 +8,10 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -28,30 +28,11 @@ from .folder import write_prior
 from .judge import SamplesConfig, edit_rows, judge_pairs, reconstruction_rows, score_table, sheet
 from .latents import cached_latents
 from .losses import noised, reconstruction_loss
-from .models import TIMESTEPS, AutoencoderConfig, Stage, TextConfig, UnetConfig, make_networks
-from .vocabulary import learn_merges, vocabulary, write_tokenizer
+from .models import TIMESTEPS, AutoencoderConfig, TextConfig, UnetConfig, make_networks
+from .stages import STAGES, Progress, cosine, unet_inputs
+from .vocabulary import Tokens, learn_merges, unknown_words, vocabulary
 
-STAGES = {"autoencoder": ("vae",), "unet": ("unet", "text_encoder")}  # what trains in each, in order
 CLIP = 1.0  # largest norm of a gradient
-
-
-@dataclass
-class Progress:
-    """How far a stage is. first: the run's step at which it began, None before; seconds: spent in its steps."""
-
-    first: int | None = None
-    seconds: float = 0.0
-
-    def at(self, step: int, stage: Stage) -> float:
-        """From 0 to 1 over the stage, by its steps, or by its minutes where these are over sooner."""
-        if self.first is None:
-            return 0.0
-        by_time = self.seconds / 60 / stage.minutes if stage.minutes else 0.0
-        return min(max((step - self.first) / stage.steps, by_time), 1.0)
-
-    def steps(self, step: int, end: int | None) -> int:
-        """How many steps were done by the run's `step`, where the stage was over at `end` (None: it is not)."""
-        return 0 if self.first is None else (step if end is None else end) - self.first
 
 
 @plugin.register("dreamcatalyst-prior-system")
@@ -99,16 +80,23 @@ class PriorSystem(System):
     def setup(self, stage: str) -> None:
         if self.networks is not None:
             return
-        data = self.data
-        self.merges = learn_merges(data.pairs.instruction)
-        self.tokens = len(vocabulary(self.merges))
-        part = self.part
-        self.networks = make_networks(part.autoencoder, part.text, part.unet, data.cfg.size, self.tokens, self.cfg.seed)
-        self.ema = copy.deepcopy(self.networks).requires_grad_(False)
+        self._make_networks(learn_merges(self.data.pairs.instruction))
         self.register_buffer("latent_std", torch.ones(()))
+        self.abar = stable_diffusion_schedule(TIMESTEPS).float()
+
+    def _make_networks(self, merges: list[tuple[str, str]]) -> None:
+        """Networks that have learned nothing, for the vocabulary of `merges`."""
+        part, self.merges = self.part, merges
+        size, tokens = self.data.cfg.size, len(vocabulary(merges))
+        self.networks = make_networks(part.autoencoder, part.text, part.unet, size, tokens, self.cfg.seed)
+        self.ema = copy.deepcopy(self.networks).requires_grad_(False)
         for network in (self.networks, self.ema):
             network.to(memory_format=torch.channels_last)
-        self.abar = stable_diffusion_schedule(TIMESTEPS).float()
+
+    @cached_property
+    def token_ids(self) -> Tokens:
+        """The tokenizer that is written with the model."""
+        return Tokens(self.path("prior") / "tokenizer", self.merges, self.part.text.tokens)
 
     @property
     def data(self) -> PriorData:
@@ -144,7 +132,7 @@ class PriorSystem(System):
         done = progress.at(step, config)
         number = step - progress.first
         optimizer = self.optimizers()[list(STAGES).index(stage)]
-        rate = config.learning_rate * min(1.0, (number + 1) / max(config.warm_up, 1)) * _cosine(done)
+        rate = config.learning_rate * min(1.0, (number + 1) / max(config.warm_up, 1)) * cosine(done)
         for group in optimizer.param_groups:
             group["lr"] = rate
         optimizer.zero_grad()
@@ -187,7 +175,10 @@ class PriorSystem(System):
         and not within every operation, keep their speed where cores are shared.
         """
         size = self.part.unet.batch_size
-        drawn = self._unet_inputs(self.data.batch(number, size), number)
+        data, config, seed = self.data, self.part.unet, self.cfg.seed
+        index = data.batch(number, size)
+        inputs = unet_inputs(data.pairs, index, self.latents, self.latent_std, self.token_ids, config, seed, number)
+        drawn = [tensor.to(self.device) for tensor in inputs]
         threads = min(torch.get_num_threads(), size) if self.device.type == "cpu" else 1
         if threads == 1:
             loss = self._unet_loss(drawn, slice(0, size))
@@ -216,46 +207,6 @@ class PriorSystem(System):
         text = self.networks["text_encoder"](ids)[0]
         predicted = self.networks["unet"](inputs, t, encoder_hidden_states=text, return_dict=False)[0]
         return F.mse_loss(predicted.float(), v, reduction="sum") / drawn[0].numel()
-
-    def _unet_inputs(self, index: np.ndarray, number: int) -> tuple[Tensor, ...]:
-        """Clean scaled latents, image latents, token numbers [B,L], noise and timesteps of one step.
-
-        Conditions are dropped as in Brooks et al. 2023, but for one thing: without an instruction and with the image,
-        the aim is the image itself. The null instruction then changes nothing, and guidance points from there.
-        Timesteps are drawn in proportion to themselves: the noisier, the more of an edit is still to be found.
-        """
-        config: UnetConfig = self.part.unet
-        rng = np.random.default_rng((self.cfg.seed, number, 1))
-        draw, noisiness = rng.random(len(index)), rng.random(len(index)) ** 0.5
-        t = torch.from_numpy((TIMESTEPS * noisiness).astype(np.int64))
-        text_end, image_end = config.drop_text, config.drop_text + config.drop_image
-        no_text = draw < text_end
-        no_image = (text_end <= draw) & (draw < image_end)
-        neither = (image_end <= draw) & (draw < image_end + config.drop_both)
-        place = index + len(self.data.pairs) * rng.integers(0, 2, len(index))  # mirrored or not
-        source, edited = (self.latents[kind][place].float() for kind in ("source", "edited"))
-        clean = torch.where(_column(no_text), source, edited)
-        image = source * _column(~(no_image | neither))
-        given = self.data.pairs.instruction[index]
-        ids = [self._ids("" if gone else str(text)) for text, gone in zip(given, no_text | neither, strict=True)]
-        noise = torch.randn(clean.shape, generator=keyed_generator(self.cfg.seed, "noise", number))
-        drawn = (clean / self.latent_std.to(clean), image, torch.stack(ids), noise, t)
-        return tuple(tensor.to(self.device) for tensor in drawn)
-
-    def _ids(self, text: str) -> Tensor:
-        """Token numbers [L] of one instruction, by the tokenizer that is written with the model."""
-        if not hasattr(self, "_tokenizer"):
-            self._known, self._tokenizer = {}, self._make_tokenizer()
-        if text not in self._known:
-            options = dict(padding="max_length", max_length=self.part.text.tokens, truncation=True)
-            self._known[text] = self._tokenizer(text, return_tensors="pt", **options).input_ids[0]
-        return self._known[text]
-
-    def _make_tokenizer(self) -> Any:
-        from transformers import CLIPTokenizer
-
-        folder = write_tokenizer(self.path("prior") / "tokenizer", self.merges, self.part.text.tokens)
-        return CLIPTokenizer.from_pretrained(folder)
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
@@ -350,20 +301,14 @@ class PriorSystem(System):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if "prior" not in checkpoint:
             raise ConfigError("resume: the checkpoint is of another kind of run, expected one of configs/prior.yaml.")
-        kept = checkpoint["prior"]
-        if kept["merges"] != self.merges:
+        state, texts = checkpoint["prior"], self.data.pairs.instruction
+        unknown = unknown_words(texts, state["merges"])
+        if unknown:
             raise DataError(
                 f"resume: {self.data.folder} has other instructions than those of the checkpoint, whose words are the "
-                f"text encoder's tokens. Name the pairs that it was trained on: data.pairs=..."
+                f"text encoder's tokens: '{unknown[0]}' is none. Name the pairs that it was trained on: data.pairs=..."
             )
-        self.progress = {name: Progress(**progress) for name, progress in kept["progress"].items()}
-        self._loss = kept["loss"]
-
-
-def _column(values: np.ndarray) -> Tensor:
-    """[B] as [B,1,1,1]."""
-    return torch.from_numpy(values)[:, None, None, None]
-
-
-def _cosine(done: float) -> float:
-    return 0.5 * (1 + math.cos(math.pi * done))
+        if state["merges"] != self.merges:  # learned by another version
+            self._make_networks(state["merges"])
+        self.progress = {name: Progress(**progress) for name, progress in state["progress"].items()}
+        self._loss = state["loss"]

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
+from torch import Tensor
+
 START, END = "<|startoftext|>", "<|endoftext|>"
+SUFFIX = "</w>"  # of the last piece of a word
 WORD = re.compile(r"[^\W\d_]+|\d|[^\s\w]+|_+")  # letters together, digits alone, marks together: as CLIP splits
 
 
@@ -26,39 +28,47 @@ def byte_letters() -> list[str]:
     return letters
 
 
+def words_of(texts: Iterable[str]) -> list[str]:
+    """The different words of `texts`, in lower case, sorted."""
+    return sorted({word for text in texts for word in WORD.findall(text.lower())})
+
+
 def learn_merges(texts: Iterable[str]) -> list[tuple[str, str]]:
-    """Byte-pair merges after which every word of `texts` is one token; the most frequent pair goes first.
+    """Byte-pair merges after which every word of `texts` is one token, by the `tokenizers` library.
 
     A word counts once, however often it stands in the texts. Words that are not among them come out as pieces of those
-    that are, or as bytes: no text is out of vocabulary.
+    that are, or as bytes: no text is out of vocabulary. The same texts give the same merges; versions of the library
+    may choose differently among pairs that are equally frequent, and so did versions of this file.
     """
+    from tokenizers import Tokenizer, models, pre_tokenizers, trainers
+
+    tokenizer = Tokenizer(models.BPE(end_of_word_suffix=SUFFIX))
+    tokenizer.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
     letters = byte_letters()
-    words = []
-    for word in sorted({word for text in texts for word in WORD.findall(text.lower())}):
-        pieces = [letters[byte] for byte in word.encode()]
-        words.append([*pieces[:-1], pieces[-1] + "</w>"])
-    merges = []
-    while pairs := Counter(pair for word in words for pair in zip(word, word[1:], strict=False)):
-        best = min(pairs, key=lambda pair: (-pairs[pair], pair))  # ties by the alphabet, so that it is one vocabulary
-        merges.append(best)
-        words = [_merged(word, best) for word in words]
-    return merges
+    words = ["".join(letters[byte] for byte in word.encode()) for word in words_of(texts)]
+    first = list(vocabulary([]))[:-2]
+    trainer = trainers.BpeTrainer(
+        vocab_size=len(first) + sum(map(len, words)),  # never reached: it ends where every word is one token
+        min_frequency=1,
+        end_of_word_suffix=SUFFIX,
+        special_tokens=first,  # numbers before training, or ties would be broken by chance
+        show_progress=False,
+    )
+    tokenizer.train_from_iterator(words, trainer)
+    merges = json.loads(tokenizer.to_str())["model"]["merges"]
+    return [tuple(pair.split(" ") if isinstance(pair, str) else pair) for pair in merges]
 
 
-def _merged(word: list[str], pair: tuple[str, str]) -> list[str]:
-    out: list[str] = []
-    for piece in word:
-        if out and (out[-1], piece) == pair:
-            out[-1] += piece
-        else:
-            out.append(piece)
-    return out
+def unknown_words(texts: Iterable[str], merges: Iterable[tuple[str, str]]) -> list[str]:
+    """The words of `texts` that are no token of their own after `merges`."""
+    letters, tokens = byte_letters(), vocabulary(merges)
+    return [word for word in words_of(texts) if "".join(letters[b] for b in word.encode()) + SUFFIX not in tokens]
 
 
 def vocabulary(merges: Iterable[tuple[str, str]]) -> dict[str, int]:
     """Token to number: the bytes, the bytes at a word's end, the merges, the marks of start and end."""
     letters = byte_letters()
-    tokens = [*letters, *(letter + "</w>" for letter in letters), *(a + b for a, b in merges), START, END]
+    tokens = [*letters, *(letter + SUFFIX for letter in letters), *(a + b for a, b in merges), START, END]
     return {token: i for i, token in enumerate(dict.fromkeys(tokens))}
 
 
@@ -76,3 +86,20 @@ def write_tokenizer(folder: Path, merges: list[tuple[str, str]], length: int) ->
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8")
     return folder
+
+
+class Tokens:
+    """Texts to token numbers, by the tokenizer that is written with the model; each text is looked up once."""
+
+    def __init__(self, folder: Path, merges: list[tuple[str, str]], length: int):
+        from transformers import CLIPTokenizer
+
+        self._tokenizer = CLIPTokenizer.from_pretrained(write_tokenizer(folder, merges, length))
+        self._options = dict(padding="max_length", max_length=length, truncation=True, return_tensors="pt")
+        self._known: dict[str, Tensor] = {}
+
+    def __call__(self, text: str) -> Tensor:
+        """Token numbers [L] of one text."""
+        if text not in self._known:
+            self._known[text] = self._tokenizer(text, **self._options).input_ids[0]
+        return self._known[text]
