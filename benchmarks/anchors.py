@@ -28,8 +28,8 @@ from dreamcatalyst.demo.worlds import PARTS, bear_statue  # noqa: E402
 from dreamcatalyst.loss.anchor import FORMS, GROUPS, AnchorConfig, anchor_loss, anchor_step  # noqa: E402
 from dreamcatalyst.render.api import rasterize  # noqa: E402
 from dreamcatalyst.report.metrics import psnr  # noqa: E402
-from dreamcatalyst.scene.edit import Splats  # noqa: E402
 from dreamcatalyst.scene.gaussians import Gaussians  # noqa: E402
+from dreamcatalyst.scene.trainable import Splats  # noqa: E402
 from dreamcatalyst.train.optim import LearningRates  # noqa: E402
 
 SIZE, VIEWS, EXTENT = 64, 6, 3.3

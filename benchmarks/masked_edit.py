@@ -20,9 +20,9 @@ sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve
 
 from dreamcatalyst.data.camera import Cameras  # noqa: E402
 from dreamcatalyst.render.frozen import Frozen  # noqa: E402
-from dreamcatalyst.scene.edit import Splats  # noqa: E402
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians  # noqa: E402
 from dreamcatalyst.scene.generations import Generations  # noqa: E402
+from dreamcatalyst.scene.trainable import Splats  # noqa: E402
 from rasterize import prepared, timed  # noqa: E402
 
 AREAS = 0.01, 0.02, 0.05, 0.10, 0.20, 0.50, 1.0

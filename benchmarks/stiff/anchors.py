@@ -8,8 +8,8 @@ import torch
 from dreamcatalyst.config import parse
 from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.loss.anchor import AnchorConfig, anchor_loss, anchor_step
-from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS
+from dreamcatalyst.scene.trainable import Splats
 from torch import Tensor
 
 from .cases import Case, Check, bound, compare, refused, worst

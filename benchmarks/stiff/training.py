@@ -18,11 +18,11 @@ import torch
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.errors import SceneError
 from dreamcatalyst.render.api import rasterize
-from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 from dreamcatalyst.scene.mask import threshold
 from dreamcatalyst.scene.ply import read_ply, write_ply
 from dreamcatalyst.scene.plyfile import read_vertices
+from dreamcatalyst.scene.trainable import Splats
 from dreamcatalyst.train.densify import DensifyConfig, densify, observe, screen_statistics
 from dreamcatalyst.train.fit import FitMethod
 from dreamcatalyst.train.optim import LearningRates

@@ -9,8 +9,8 @@ import torch
 from dreamcatalyst.config import parse
 from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.loss.anchor import AnchorConfig, anchor_loss, anchor_step
-from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
+from dreamcatalyst.scene.trainable import Splats
 
 ON = dict(kind="source", form="loss", lambda_color=5.0, weight_init_g0=0.5, weight_init=0.1, weight_multiplier=2.0)
 

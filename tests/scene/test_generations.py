@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from dreamcatalyst.errors import ConfigError, SceneError
-from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 from dreamcatalyst.scene.generations import ANCHORS, Generations
+from dreamcatalyst.scene.trainable import Splats
 
 
 def splats_at(x: list[float], editable: list[bool] | None = None) -> Splats:

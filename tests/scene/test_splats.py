@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from dreamcatalyst.errors import SceneError
-from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 from dreamcatalyst.scene.generations import Generations
+from dreamcatalyst.scene.trainable import Splats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 from dreamcatalyst.errors import SceneError
 from dreamcatalyst.render.api import Render
-from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 from dreamcatalyst.scene.generations import Generations
+from dreamcatalyst.scene.trainable import Splats
 from dreamcatalyst.train.densify import DensifyConfig, densify, observe, reset_opacity, screen_statistics, select
 from dreamcatalyst.train.edit import EditSystem
 from dreamcatalyst.train.optim import LearningRates

@@ -12,9 +12,9 @@ import math
 import pytest
 import torch
 from dreamcatalyst.errors import SceneError
-from dreamcatalyst.scene.edit import Splats
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 from dreamcatalyst.scene.generations import ANCHORS, Generations
+from dreamcatalyst.scene.trainable import Splats
 from dreamcatalyst.train.densify import DensifyConfig, densify, reset_opacity, screen_statistics
 from hypothesis import given, settings
 from hypothesis import strategies as st

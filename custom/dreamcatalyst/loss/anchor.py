@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..config import NonNegative
 from ..errors import ConfigError, choose
-from ..scene.edit import Splats
 from ..scene.generations import ANCHORS, Generations, anchor_of
+from ..scene.trainable import Splats
 
 GROUPS = {  # lambda of the config -> raw parameters that it weighs
     "color": ("sh0", "shN"),

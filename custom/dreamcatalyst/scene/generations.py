@@ -15,8 +15,8 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from ..errors import SceneError, choose
-from .edit import Splats
 from .gaussians import PARAMETERS
+from .trainable import Splats
 
 ANCHORS = ("last-densify", "source")
 GENERATION = "generation"  # the per-splat state, int64

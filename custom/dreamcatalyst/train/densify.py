@@ -18,9 +18,9 @@ from .. import plugin
 from ..diffusion.noise import keyed_generator
 from ..errors import SceneError
 from ..render.api import Render
-from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
+from ..scene.trainable import Splats
 from .density import DensifyConfig, Density, Moment
 
 STATISTICS = ("grad_sum", "grad_count", "max_radius")

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from ..config import BelowOne, Between, Count, Fraction, NonNegative, parse
 from ..registry import Registry
 from ..render.api import Render
-from ..scene.edit import Splats
 from ..scene.generations import Generations
+from ..scene.trainable import Splats
 
 DENSITY = Registry("density strategy", __package__)
 DENSITY.add("adaptive", ".densify:Adaptive")

@@ -12,8 +12,8 @@ from ..data.camera import Cameras
 from ..render.api import Backend, Render, find_backend, rasterize
 from ..render.frozen import Frozen
 from ..report.clock import Clock
-from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
+from ..scene.trainable import Splats
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,10 @@ from ..render.api import Render
 from ..report.metrics import psnr
 from ..report.pictures import write_png
 from ..report.run import Panels
-from ..scene.edit import Splats
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from ..scene.ply import read_splats, write_ply
+from ..scene.trainable import Splats
 from ..segment.api import MaskRequest
 from .edit_config import EditParts
 from .finite import require_finite

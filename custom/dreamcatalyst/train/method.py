@@ -20,11 +20,11 @@ from ..render.api import Backend, Render
 from ..render.frozen import Frozen
 from ..report.clock import Clock
 from ..report.run import Panels, ReportConfig
-from ..scene.edit import Splats
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
 from ..scene.ply import read_splats
+from ..scene.trainable import Splats
 from .datamodule import SplatData
 from .density import DensifyConfig
 from .drawing import Drawer, RendererConfig

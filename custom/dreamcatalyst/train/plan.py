@@ -16,8 +16,8 @@ from ..guidance.guidance import Guidance
 from ..loss.anchor import AnchorConfig
 from ..loss.perceptual import WEIGHT_BYTES
 from ..render.api import Backend
-from ..scene.edit import Splats
 from ..scene.gaussians import PARAMETERS, Gaussians
+from ..scene.trainable import Splats
 from ..segment.api import SEGMENTERS
 from .density import DensifyConfig
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from .. import plugin
 from ..report.pictures import picture_row, write_png
-from ..scene.edit import UPDATE
 from ..scene.gaussians import Gaussians
+from ..scene.trainable import UPDATE
 from ..segment.api import EXTRA, Mask, MaskConfig, MaskRequest, make_mask
 from ..segment.pictures import mask_panels
 

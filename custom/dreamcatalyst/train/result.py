@@ -9,10 +9,10 @@ from typing import Any
 import torch
 
 from ..errors import SceneError
-from ..scene.edit import Splats
 from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
 from ..scene.ply import write_ply
+from ..scene.trainable import Splats
 from .density import Density
 
 RESULT = "last.ply"

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ..cache import ByteCache
 from ..data.camera import Cameras
-from ..scene.edit import Splats
 from ..scene.gaussians import Gaussians
+from ..scene.trainable import Splats
 from .drawing import Drawer
 from .region import EditRegion
 

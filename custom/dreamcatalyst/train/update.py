@@ -12,7 +12,7 @@ from ..errors import NumericalError
 from ..loss.terms import gradient_shares, total, update_share
 from ..render.api import Render
 from ..report.clock import LOGGING, Clock
-from ..scene.edit import Splats
+from ..scene.trainable import Splats
 from .density import Density
 from .finite import gradient_norms, require_finite, restore, snapshot
 
