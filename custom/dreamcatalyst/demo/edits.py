@@ -30,7 +30,7 @@ NOTHING = "nothing"  # the edit that leaves a world as it is
 
 
 @dataclass(frozen=True)
-class Edit:
+class WorldEdit:
     """One thing that can be asked for.
 
     name: of the edit. scope: "object" (only the target changes) or "global". phrases: the instructions that ask for it,
@@ -87,38 +87,44 @@ PAINTS = {
 THINGS = ("bear statue", "ball", "box", "flower pot")
 
 
-def _animals() -> list[Edit]:
+def _animals() -> list[WorldEdit]:
     bears = {
         "panda": (panda, PANDA_SHAPE, ("Turn it into a panda bear", "Give the bear the fur of a panda"), 7.0),
         "polar bear": (polar_bear, POLAR_SHAPE, ("Give the bear the fur of a polar bear",), 3.0),
         "grizzly bear": (grizzly, GRIZZLY_SHAPE, ("Turn the statue into a brown bear", "Turn it into a grizzly"), 3.0),
     }
     return [
-        Edit(name, "object", _turned_into(name) + more, partial(dress, coat=coat, shape=shape), "bear statue", weight)
+        WorldEdit(
+            name, "object", _turned_into(name) + more, partial(dress, coat=coat, shape=shape), "bear statue", weight
+        )
         for name, (coat, shape, more, weight) in bears.items()
     ]
 
 
-def _metals() -> list[Edit]:
+def _metals() -> list[WorldEdit]:
     bronze = _turned_into("bronze statue") + (
         "Make the bear bronze",
         "Make the statue out of bronze",
         "Cast the bear in bronze",
     )
-    made = [
-        Edit("bronze statue", "object", bronze, partial(metal, thing="bear statue", stops=BRONZE), "bear statue", 3.0)
+    metals = [
+        WorldEdit(
+            "bronze statue", "object", bronze, partial(metal, thing="bear statue", stops=BRONZE), "bear statue", 3.0
+        )
     ]
     for thing in THINGS:
         gold = _painted(thing, "golden") + (f"Make the {thing} gold", f"Turn the {thing} into gold")
         gold += _turned_into("golden statue") if thing == "bear statue" else ()
         weight = 2.0 if thing == "bear statue" else 0.3
-        made.append(Edit(f"golden {thing}", "object", gold, partial(metal, thing=thing, stops=GOLD), thing, weight))
-    return made
+        metals.append(
+            WorldEdit(f"golden {thing}", "object", gold, partial(metal, thing=thing, stops=GOLD), thing, weight)
+        )
+    return metals
 
 
-def _paints() -> list[Edit]:
+def _paints() -> list[WorldEdit]:
     return [
-        Edit(
+        WorldEdit(
             f"{color} {thing}",
             "object",
             _painted(thing, color),
@@ -137,14 +143,14 @@ def _given(a: str, name: str, more: tuple[str, ...]) -> tuple[str, ...]:
     return (*phrases, f"Add {thing} to the bear", f"Add {thing}", thing.capitalize(), *more)
 
 
-def _additions() -> list[Edit]:
+def _additions() -> list[WorldEdit]:
     table = (
         ("party hat", "hat", party_hat, _given("a ", "party hat", ("Make the bear wear a party hat",))),
         ("rabbit ears", "rabbit ear", rabbit_ears, _given("", "rabbit ears", ("Give the bear the ears of a rabbit",))),
         ("scarf", "scarf", scarf, _given("a ", "scarf", ("Make the bear wear a scarf",))),
     )
     return [
-        Edit(name, "object", phrases, partial(with_addition, make=make, part=part), "bear statue", 0.0, adds=True)
+        WorldEdit(name, "object", phrases, partial(with_addition, make=make, part=part), "bear statue", 0.0, adds=True)
         for name, part, make, phrases in table
     ]
 
@@ -191,29 +197,29 @@ HOURS_AND_SEASONS = (  # name, function, whether in a room too, phrases; the pap
 NO_CHANGE = ("", "Leave it as it is", "Change nothing", "Do nothing", "Keep it the same", "No change")
 
 
-def _table() -> dict[str, Edit]:
+def _table() -> dict[str, WorldEdit]:
     edits = [*_animals(), *_metals(), *_paints()]
     edits += [
-        Edit(name, "global", phrases, apply, weight=2.2, indoors=indoors)
+        WorldEdit(name, "global", phrases, apply, weight=2.2, indoors=indoors)
         for name, apply, indoors, phrases in HOURS_AND_SEASONS
     ]
-    edits.append(Edit(NOTHING, "global", NO_CHANGE, lambda world: world.scene, weight=1.5))
+    edits.append(WorldEdit(NOTHING, "global", NO_CHANGE, lambda world: world.scene, weight=1.5))
     edits += _additions()
     return {edit.name: edit for edit in edits}
 
 
-EDITS: dict[str, Edit] = _table()
+EDITS: dict[str, WorldEdit] = _table()
 
 
 _BY_PHRASE = {normalised(phrase): edit for edit in EDITS.values() for phrase in edit.phrases}
 
 
-def find_edit(instruction: str) -> Edit | None:
+def find_edit(instruction: str) -> WorldEdit | None:
     """The edit that `instruction` asks for, whatever its case, punctuation and spaces; None where it is unknown."""
     return _BY_PHRASE.get(normalised(instruction))
 
 
-def possible(world: World) -> list[Edit]:
+def possible(world: World) -> list[WorldEdit]:
     """The edits that make sense in `world`: their target stands in it, and weather needs a sky."""
     names = {thing.name for thing in world.things}
     return [e for e in EDITS.values() if (e.target is None or e.target in names) and (e.indoors or world.outdoors)]

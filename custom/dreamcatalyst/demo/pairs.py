@@ -18,7 +18,7 @@ from ..errors import DataError
 from ..files import replacing, write_text
 from ..render.api import rasterize
 from ..scene.gaussians import Gaussians
-from .edits import EDITS, NOTHING, Edit, apply_edit, possible
+from .edits import EDITS, NOTHING, WorldEdit, apply_edit, possible
 from .photographs import crop, load_photographs
 from .random_world import HELD_OUT, random_world
 from .worlds import World
@@ -42,7 +42,7 @@ ARRAYS = {  # of a shard: number type and shape
 Operators = Callable[[str], Callable[[Tensor], Tensor]]  # an edit's name -> RGB [B,3,H,W] in [0,1] to the same
 
 
-def worded(edit: Edit, rng: Generator) -> str:
+def worded(edit: WorldEdit, rng: Generator) -> str:
     """One of the edit's instructions, the first more often; at times in lower or upper case or with a full stop."""
     text = edit.phrases[0] if rng.random() < 0.3 else edit.phrases[rng.integers(len(edit.phrases))]
     style = rng.random()
@@ -53,14 +53,14 @@ def worded(edit: Edit, rng: Generator) -> str:
     return text + "." if text and rng.random() < 0.1 else text
 
 
-def drawn(known: list[Edit], rng: Generator) -> list[Edit]:
+def drawn(known: list[WorldEdit], rng: Generator) -> list[WorldEdit]:
     """EDITS_PER_SOURCE different ones of the `known` edits, drawn by their weights."""
     weights = np.array([edit.weight for edit in known])
     chosen = rng.choice(len(known), EDITS_PER_SOURCE, replace=False, p=weights / weights.sum())
     return [known[i] for i in chosen]
 
 
-def _pair(source: ndarray, edited: ndarray, mask: ndarray, edit: Edit, world: int, rng: Generator) -> dict:
+def _pair(source: ndarray, edited: ndarray, mask: ndarray, edit: WorldEdit, world: int, rng: Generator) -> dict:
     return dict(source=source, edited=edited, mask=mask, instruction=worded(edit, rng), edit=edit.name, world=world)
 
 

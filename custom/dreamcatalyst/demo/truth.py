@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from ..data.truth import GroundTruth
-from .edits import Edit, apply_edit, possible
+from .edits import WorldEdit, apply_edit, possible
 from .worlds import World
 
 
-def ground_truth(world: World, edit: Edit | None) -> GroundTruth | None:
+def ground_truth(world: World, edit: WorldEdit | None) -> GroundTruth | None:
     """The outcome of an edit; None for None, and for one that makes no sense in this world.
 
     The edit is about its target's splats or, where it adds something, about what it adds.

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
+import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 SCALES = 4  # halvings of an image, at most, at which its error is seen again
 
@@ -29,3 +32,17 @@ def noised(clean: Tensor, noise: Tensor, abar: Tensor) -> tuple[Tensor, Tensor]:
     """x_t and v of clean latents [B,C,h,w] at abar [B] (Salimans & Ho 2022: v = sqrt(abar) eps - sqrt(1-abar) x_0)."""
     signal, sigma = abar.sqrt()[:, None, None, None], (1 - abar).sqrt()[:, None, None, None]
     return signal * clean + sigma * noise, signal * noise - sigma * clean
+
+
+def unet_loss(networks: Mapping[str, nn.Module], abar: Tensor, inputs: Sequence[Tensor], rows: slice) -> Tensor:
+    """What `rows` of a batch add to its mean squared error in v (Salimans & Ho 2022), unweighted: what an instruction
+    asks for is decided at high noise, where weights by the signal-to-noise ratio all but vanish.
+
+    networks: "unet" and "text_encoder". abar [T]. inputs: of `stages.unet_inputs`.
+    """
+    clean, image, ids, noise, t = (tensor[rows] for tensor in inputs)
+    noisy, v = noised(clean, noise, abar.to(clean.device)[t])
+    joined = torch.cat([noisy, image], 1).to(memory_format=torch.channels_last)
+    text = networks["text_encoder"](ids)[0]
+    predicted = networks["unet"](joined, t, encoder_hidden_states=text, return_dict=False)[0]
+    return F.mse_loss(predicted.float(), v, reduction="sum") / inputs[0].numel()

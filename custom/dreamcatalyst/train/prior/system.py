@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ... import plugin
@@ -27,7 +26,7 @@ from .data import PriorData
 from .folder import write_prior
 from .judge import SamplesConfig, edit_rows, judge_pairs, reconstruction_rows, score_table, sheet
 from .latents import cached_latents
-from .losses import noised, reconstruction_loss
+from .losses import reconstruction_loss, unet_loss
 from .models import TIMESTEPS, AutoencoderConfig, TextConfig, UnetConfig, make_networks
 from .stages import STAGES, Progress, cosine, unet_inputs
 from .vocabulary import Tokens, learn_merges, unknown_words, vocabulary
@@ -103,15 +102,8 @@ class PriorSystem(System):
         return self.trainer.datamodule
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        return [
-            torch.optim.AdamW(
-                self.trained(stage),
-                lr=self.of(stage).learning_rate,
-                betas=(0.9, 0.99),
-                weight_decay=0.01,
-            )
-            for stage in STAGES
-        ]
+        options = dict(betas=(0.9, 0.99), weight_decay=0.01)
+        return [torch.optim.AdamW(self.trained(name), lr=self.of(name).learning_rate, **options) for name in STAGES]
 
     # --- training
 
@@ -181,14 +173,14 @@ class PriorSystem(System):
         drawn = [tensor.to(self.device) for tensor in inputs]
         threads = min(torch.get_num_threads(), size) if self.device.type == "cpu" else 1
         if threads == 1:
-            loss = self._unet_loss(drawn, slice(0, size))
+            loss = unet_loss(self.networks, self.abar, drawn, slice(0, size))
             self.manual_backward(loss)
             return float(loss.detach())
         parameters, ends = self.trained("unet"), [size * i // threads for i in range(threads + 1)]
 
         def part(rows: slice) -> tuple[Tensor, Sequence[Tensor | None]]:
             with torch.enable_grad():
-                loss = self._unet_loss(drawn, rows)
+                loss = unet_loss(self.networks, self.abar, drawn, rows)
                 return loss.detach(), torch.autograd.grad(loss, parameters, allow_unused=True)
 
         if self._workers is None:
@@ -197,16 +189,6 @@ class PriorSystem(System):
         for parameter, *parts in zip(parameters, *gradients, strict=True):
             parameter.grad = None if parts[0] is None else sum(parts)
         return float(sum(losses))
-
-    def _unet_loss(self, drawn: Sequence[Tensor], rows: slice) -> Tensor:
-        """What `rows` of a batch add to the mean squared error in v (Salimans & Ho 2022), unweighted: what an
-        instruction asks for is decided at high noise, where weights by the signal-to-noise ratio all but vanish."""
-        clean, image, ids, noise, t = (tensor[rows] for tensor in drawn)
-        noisy, v = noised(clean, noise, self.abar.to(self.device)[t])
-        inputs = torch.cat([noisy, image], 1).to(memory_format=torch.channels_last)
-        text = self.networks["text_encoder"](ids)[0]
-        predicted = self.networks["unet"](inputs, t, encoder_hidden_states=text, return_dict=False)[0]
-        return F.mse_loss(predicted.float(), v, reduction="sum") / drawn[0].numel()
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         super().on_train_batch_end(outputs, batch, batch_idx)
