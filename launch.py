@@ -15,6 +15,7 @@ import signal
 import sys
 import traceback
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -293,7 +294,7 @@ def make_trainer(config: Any, callbacks: list[Any], checkpoints: Any, training: 
     return trainer
 
 
-def known_options(cls: type, section: Any, where: str, ours: set[str] = frozenset()) -> dict[str, Any]:
+def known_options(cls: type, section: Any, where: str, ours: Collection[str] = ()) -> dict[str, Any]:
     """A section of the YAML as keyword arguments for `cls`, without keys that are `ours`. Raises ConfigError for one
     that it does not take."""
     from dreamcatalyst.errors import ConfigError, unknown
@@ -303,7 +304,8 @@ def known_options(cls: type, section: Any, where: str, ours: set[str] = frozense
     for key in section:
         if key not in known and key not in ours:
             raise ConfigError(unknown("key", key, {*known, *ours}, where))
-    return {key: value for key, value in OmegaConf.to_container(OmegaConf.create(section)).items() if key not in ours}
+    plain: Any = OmegaConf.to_container(OmegaConf.create(section))
+    return {key: value for key, value in plain.items() if key not in ours}
 
 
 def preview(system: Any, data: Any, trainer: Any) -> None:

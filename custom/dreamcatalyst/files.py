@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from .errors import FileError
 
@@ -128,7 +128,7 @@ def save(path: str | Path, state: Any) -> Path:
 
     with replacing(path) as part, part.open("w+b") as file:
         sink = _Sink(file)
-        torch.save(state, sink)
+        torch.save(state, cast(BinaryIO, sink))
         sink.close()
         end = file.seek(0, os.SEEK_END) - 2  # there stands the length of the comment, 0
         comment = MARK + _digest(file, end).encode()

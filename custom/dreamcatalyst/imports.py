@@ -42,6 +42,8 @@ def _import_file(path: Path, place: str) -> None:
     if module_name in sys.modules:
         return
     spec = importlib.util.spec_from_file_location(module_name, path.resolve())
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"{place}: '{path}' is no Python file.")
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module
     try:

@@ -99,7 +99,7 @@ def offer(modules: Mapping[str, str], package: str) -> None:
         oldest = ".".join(map(str, OLDEST_HOST))
         raise ImportError(f"{package} needs threestudio >= {oldest}, this is {version}. Update the host: git pull.")
     if _home is not None:
-        first, second = (Path(home.__file__).parent for home in (_home, sys.modules[package]))
+        first, second = (Path(str(home.__file__)).parent for home in (_home, sys.modules[package]))
         sys.modules[package] = _home  # the host has put the second in its place; what is imported later is the first's
         raise ImportError(
             f"{package} is in custom/ twice: {first}, which is used, and {second}. Remove one of them from custom/."

@@ -16,7 +16,7 @@ class Registry:
     kind: what the parts are, in words, for the error message. package: what relative targets are relative to.
     """
 
-    def __init__(self, kind: str, package: str):
+    def __init__(self, kind: str, package: str | None):
         self.kind, self.package = kind, package
         self._targets: dict[str, Any] = {}
 

@@ -62,7 +62,7 @@ class Stop:
     @property
     def status(self) -> int:
         """The exit status that a shell gives to a process that the signal ended."""
-        return 128 + self.asked
+        return 128 + (self.asked or 0)
 
     def install(self) -> None:
         """Take the signals, but for those that whoever started us has us ignore (nohup)."""

@@ -39,7 +39,7 @@ class BaseObject:
     class Config:
         pass
 
-    cfg: Config
+    cfg: Any
 
     def __init__(self, cfg: Any = None, *args: Any, **kwargs: Any):
         self.cfg = parse_structured(self.Config, cfg or {})
@@ -68,7 +68,7 @@ class BaseSystem(LightningModule):
         cleanup_after_validation_step: bool = False
         cleanup_after_test_step: bool = False
 
-    cfg: Config
+    cfg: Any
 
     def __init__(self, cfg: Any, resumed: bool = False):
         super().__init__()

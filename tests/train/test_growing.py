@@ -67,7 +67,7 @@ def test_what_is_beside_the_rule_keeps_its_balance_whatever_the_reduction(size):
         source = torch.rand(1, size, size, 3, generator=torch.Generator().manual_seed(0))
         rgb = (source + 0.1).requires_grad_()
         given = made.step(rgb, source, [0], 3, 10)
-        leak = made.in_balance((rgb - source).abs().mean(), given)
+        leak = made.objective.in_balance((rgb - source).abs().mean(), given)
         rule, beside = (torch.autograd.grad(loss, rgb, retain_graph=True)[0].norm() for loss in (given.loss, leak))
         ratios.append(float(beside / rule))
     assert ratios[1] == pytest.approx(ratios[0], rel=1e-4)

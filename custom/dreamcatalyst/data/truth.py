@@ -18,11 +18,14 @@ class SplatScene(Protocol):
     """What is asked of splats here (a Gaussians has it): means [N,3] and standard deviations [N,3], world units;
     opacities [N] in (0,1)."""
 
-    means: Tensor
-    scales: Tensor
-    opacities: Tensor
+    @property
+    def means(self) -> Tensor: ...
+    @property
+    def scales(self) -> Tensor: ...
+    @property
+    def opacities(self) -> Tensor: ...
 
-    def to(self, device: torch.device | str) -> SplatScene:
+    def to(self, *where: Any, **how: Any) -> Any:
         """The same splats on another device."""
 
 

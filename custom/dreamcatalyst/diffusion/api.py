@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,6 +88,10 @@ class Prior(ABC):
     @abstractmethod
     def predict_noise(self, rows: Sequence[Row], timestep: int) -> list[Tensor]:
         """The noise prediction of every row at index `timestep` (0..T-1): [B,C,h,w] each, no graph, in one call."""
+
+    def tell_truth(self, image: Callable[[int], Tensor]) -> None:
+        """Of a prior that `takes_truth`: number of a view to the edited scene there, [H,W,3] in [0,1]."""
+        raise PriorError(f"{type(self).__name__} takes no truth")
 
     def stack(self, conditions: Sequence[Any]) -> Any:
         """The conditions of single images as one condition of a batch, in that order."""

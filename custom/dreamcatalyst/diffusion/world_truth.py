@@ -43,6 +43,9 @@ class WorldTruth(ClosedForm):
         super().__init__(*args, **kwargs)
         self.truth = Source()  # shared by the copies that `with_spread` makes
 
+    def tell_truth(self, image: Callable[[int], Tensor]) -> None:
+        self.truth.image = image
+
     def with_spread(self, spread: float) -> WorldTruth:
         other = super().with_spread(spread)
         other.truth = self.truth

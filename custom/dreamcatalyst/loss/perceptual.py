@@ -7,6 +7,7 @@ Two files hold all of it: torchvision's VGG-16 (`features.*`) and LPIPS's linear
 
 from __future__ import annotations
 
+from functools import reduce
 from pathlib import Path
 
 import torch
@@ -55,6 +56,7 @@ class Lpips:
         place, channels = 0, 3  # torchvision numbers convolutions, activations and poolings alike
         for number, widths in enumerate(BLOCKS):
             self.blocks.append([])
+            width = widths[-1]
             for width in widths:
                 weight = self._take(vgg, f"features.{place}.weight", (width, channels, 3, 3), where)
                 bias = self._take(vgg, f"features.{place}.bias", (width,), where)
@@ -89,4 +91,4 @@ class Lpips:
             size = [max(SMALLEST, side) for side in a.shape[1:3]]
             a, b = (F.interpolate(x.permute(0, 3, 1, 2), size, mode="bilinear").permute(0, 2, 3, 1) for x in (a, b))
         pairs = zip(self._features(a), self._features(b), self.linear, strict=True)
-        return sum((F.conv2d((x - y).square(), lin)).mean() for x, y, lin in pairs)
+        return reduce(torch.add, (F.conv2d((x - y).square(), lin).mean() for x, y, lin in pairs))

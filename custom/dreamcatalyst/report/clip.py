@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..diffusion.folder import find_folder, load, not_given
 from ..errors import ConfigError, PriorError
@@ -57,7 +57,7 @@ class Clip:
         self.mean, self.std = _standard(folder)
 
     @cached_property
-    def _model(self) -> nn.Module:
+    def _model(self) -> Any:
         from transformers import CLIPModel
 
         return load(CLIPModel, self.path, None, torch.float32).to(self.device)

@@ -20,7 +20,7 @@ class Clock:
     """
 
     def __init__(self, wait: Callable[[], None] | None = None):
-        self.stages = dict.fromkeys(STAGES, 0.0)  # seconds
+        self.stages: dict[str, float] = dict.fromkeys(STAGES, 0.0)  # seconds
         self.wait = wait
         self._open = [OTHER]
         self._since: float | None = None  # None while it stands still

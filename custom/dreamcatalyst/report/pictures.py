@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -53,9 +54,9 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = 24) -> Path
             part, fps=fps, codec="libx264", quality=8, macro_block_size=2, pixelformat="yuv420p"
         ) as out:
             for frame in frames:
-                out.append_data(_even(frame))
+                cast(Any, out).append_data(_even(frame))
         with imageio.get_reader(part) as made:  # where the disk is full, the writer says nothing
-            made.get_data(0)
+            cast(Any, made).get_data(0)
     return path
 
 

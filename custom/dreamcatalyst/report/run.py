@@ -15,7 +15,6 @@ from ..data.camera import Cameras
 from ..data.views import Capture
 from ..errors import ConfigError
 from ..render.api import Render
-from ..scene.gaussians import Gaussians
 from .clip import ClipJudge
 from .metrics import compare
 
@@ -74,7 +73,7 @@ class RunFacts:
     step: int
     splats: int
     plan: str
-    scenes: Callable[[], Mapping[str, Gaussians]]
+    scenes: Callable[[], Mapping[str, Any]]
     draw: Callable[..., Render]
     picture: Callable[[int], Tensor]
     references: Callable[[int], Mapping[str, Tensor]]

@@ -45,12 +45,12 @@ def from_points(
 
 def neighbour_distance(xyz: Float[np.ndarray, "P 3"], k: int = 3) -> Float[np.ndarray, " P"]:
     """Root mean square distance [P] of each point to its `k` nearest others, or to all others; 0 for P = 1."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     k = min(k, len(xyz) - 1)
     if k == 0:
         return np.zeros(len(xyz))
-    distances, _ = cKDTree(xyz).query(xyz, k=k + 1, workers=-1)
+    distances, _ = KDTree(xyz).query(xyz, k=k + 1, workers=-1)
     return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))  # column 0 is the point itself, or one that coincides
 
 

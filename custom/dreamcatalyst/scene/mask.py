@@ -5,6 +5,8 @@ Distances are in world units.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -88,8 +90,8 @@ def feather(means: Float[Tensor, "N 3"], mask: Bool[Tensor, " N"], width: float)
     update = mask.to(means.dtype)
     if width <= 0 or not bool(mask.any()) or bool(mask.all()):
         return update
-    found, _ = _nearest(means[~mask], means[mask], 1)
-    update[mask] = torch.from_numpy(found[:, 0] / width).to(update).clamp(FAINTEST, 1)
+    distances, _ = _nearest(means[~mask], means[mask], 1)
+    update[mask] = torch.from_numpy(distances[:, 0] / width).to(update).clamp(FAINTEST, 1)
     return update
 
 
@@ -97,8 +99,8 @@ def _nearest(
     points: Float[Tensor, "P 3"], queries: Float[Tensor, "Q 3"], k: int
 ) -> tuple[Float[np.ndarray, "Q k"], Int[np.ndarray, "Q k"]]:
     """Distances [Q,k] of `queries` [Q,3] to their k nearest `points` [P,3], and the numbers [Q,k] of those."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    points, queries = (t.detach().cpu().double().numpy() for t in (points, queries))
-    distances, numbers = cKDTree(points).query(queries, k=[*range(1, k + 1)])
-    return distances, numbers
+    there, here = (t.detach().cpu().double().numpy() for t in (points, queries))
+    query: Any = KDTree(there).query  # whose annotation knows no list for k, which keeps the axis of one neighbour
+    return query(here, k=[*range(1, k + 1)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, get_type_hints
 
 from .. import plugin
@@ -14,12 +13,9 @@ class System(plugin.BaseSystem):
     """Base of all registered systems. Parts: the sections of Config that are free dicts, each with its dataclass; they
     are in `self.part`, parsed, when `configure` returns."""
 
-    @dataclass(frozen=True)
-    class Parts:
-        """None, so far."""
-
+    Parts: type[Any] = object  # a dataclass: name of a section to its own dataclass
     parts: dict[str, type] = {}  # the same by name, for config.check
-    part: Parts
+    part: Any
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -117,7 +117,8 @@ class SplatData(plugin.pl.LightningDataModule):
         return DataLoader(StepViews(self), batch_size=None)
 
     def _each(self) -> DataLoader:
-        return DataLoader([{"index": [i]} for i in self.held_out], batch_size=None)
+        views: Any = [{"index": [i]} for i in self.held_out]  # a list is a dataset
+        return DataLoader(views, batch_size=None)
 
     def val_dataloader(self) -> DataLoader:
         return self._each()

@@ -160,7 +160,8 @@ def densify(
     if tried and bool(asked.any()):
         origins = candidate_parents(asked, tried, generator)
         new = candidate_children(scene[origins], config, extent, generator)
-        changed = {n: torch.cat([changed.get(n, getattr(scene, n)[parents]), value]) for n, value in new.items()}
+        before = {name: getattr(scene, name)[parents] for name in new} | changed
+        changed = {name: torch.cat([before[name], value]) for name, value in new.items()}
         parents = torch.cat([parents, origins])
     if generations is not None:
         changed |= generations.newborn(splats, parents, changed)

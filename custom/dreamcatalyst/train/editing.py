@@ -21,6 +21,7 @@ from ..guidance.guidance import Guidance
 from ..loss.anchor import anchor_loss, anchor_step
 from ..loss.perceptual import Lpips
 from ..render.api import Render
+from ..report.clock import Clock
 from ..report.metrics import psnr
 from ..report.pictures import write_png
 from ..report.run import Panels
@@ -53,24 +54,26 @@ def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> 
 class EditMethod(Method):
     """Edits the splats of gs_source (or those that the capture carries) as the instruction says.
 
-    guidance, source, perceptual, truth: None until `prepare`.
+    guidance, source: the prior with its rule, and the scene before the edit; `prepare` loads them. perceptual: LPIPS,
+    where the loss has it. truth: what the edit should become, where that is known.
     """
 
     part: EditParts
+    guidance: Guidance
+    source: SourceViews
 
-    def __init__(self, cfg: Any, part: EditParts, clock: Any):
+    def __init__(self, cfg: Any, part: EditParts, clock: Clock):
         super().__init__(cfg, part, clock)
         if cfg.mode:
             choose("mode", cfg.mode, cfg.steps, "system.mode")
         chosen_prior(part.guidance)  # what the kinds of prior and mask take is looked at before any is made
         part.mask.segmenter()
-        self.guidance: Guidance | None = None
-        self.source: SourceViews | None = None
         self.truth: GroundTruth | None = None
         self.perceptual: Lpips | None = None
         self.generations = part.anchor.generations()
         self._references = ByteCache(self._cache_bytes)
         self._regions: dict[int, Tensor | None] = {}
+        self._prepared = False
 
     @property
     def _cache_bytes(self) -> int:
@@ -85,23 +88,24 @@ class EditMethod(Method):
     def prepare(self) -> None:
         """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""
         super().prepare()
+        if self._prepared:
+            return
         device, words, losses = self.context.device, self.part.prompt_processor, self.part.loss
-        if self.guidance is None:
-            self.guidance = Guidance(self.part.guidance, words.prompt, words.source_prompt, device=device)
-            self.guidance.stage = self.clock.stage
-            warn_of_unknown(self.guidance.prior.instructions, words.prompt)
-        if losses.lambda_perceptual and self.perceptual is None:
+        self.guidance = Guidance(self.part.guidance, words.prompt, words.source_prompt, device=device)
+        self.guidance.stage = self.clock.stage
+        warn_of_unknown(self.guidance.prior.instructions, words.prompt)
+        if losses.lambda_perceptual:
             if not self.guidance.objective.gives_pictures:
                 raise ConfigError(
                     f"system.loss.lambda_perceptual: rule '{self.guidance.rule.name}' delivers no picture to compare "
                     "with. Set it to 0, or use the rule in2n."
                 )
             self.perceptual = Lpips(losses.perceptual_weights, device, "system.loss.perceptual_weights")
-        if self.source is None:
-            self.check_detail()
-            scene = self.given_scene() if not self.cfg.original else read_splats(self.cfg.original, origin=self.origin)
-            self.source = SourceViews(scene.to(device), self.draw, self.camera, lambda: self.splats, self._cache_bytes)
-            self._find_truth()
+        self.check_detail()
+        scene = self.given_scene() if not self.cfg.original else read_splats(self.cfg.original, origin=self.origin)
+        self.source = SourceViews(scene.to(device), self.draw, self.camera, lambda: self._splats, self._cache_bytes)
+        self._find_truth()
+        self._prepared = True
 
     def _find_truth(self) -> None:
         # Splats of one's own are another scene, and a prior that is exact has a truth of its own.
@@ -118,8 +122,9 @@ class EditMethod(Method):
                 f"system.guidance.prior_type: no outcome of '{prompt}' is known in {capture.source}."
                 f"{nearest(prompt, known)} Known, in several wordings: {', '.join(known)}."
             )
-        if prior.takes_truth and truth is not None:
-            prior.truth.image = lambda index: self.truth.image(self.draw, self.camera(index))
+        if prior.takes_truth and self.truth is not None:
+            truth = self.truth
+            prior.tell_truth(lambda index: truth.image(self.draw, self.camera(index)))
 
     @cached_property
     def fitted(self) -> Fitted | None:
@@ -215,7 +220,7 @@ class EditMethod(Method):
         if self.source.region is None or region == "everywhere":
             return None
         if region == "start":
-            return torch.stack([self.source.view(i)[1] for i in index])
+            return torch.stack([share for i in index if (share := self.source.view(i)[1]) is not None])
         scene, camera = self.splats.scene.detach(), self.camera(index)
         share = scene.means.new_ones(len(scene), 1)
         share[: len(scene) - len(self.splats)] = 0
@@ -235,7 +240,7 @@ class EditMethod(Method):
         if share is not None and losses.lambda_outside:
             leak = self.guidance.objective.in_balance(((1 - share) * (render.rgb - sources)).abs().mean(), guided)
             terms["outside"], numbers["outside"] = losses.lambda_outside * leak, float(leak.detach())
-        if self.perceptual is not None:
+        if self.perceptual is not None and guided.target is not None:
             distance = self.perceptual(shown, guided.target)
             terms["perceptual"] = losses.lambda_perceptual * distance
             numbers["perceptual"] = float(distance.detach())
@@ -268,8 +273,9 @@ class EditMethod(Method):
         if known is None:
             return {"source": source}
         rest = self.guidance.objective.expected(source, index)
-        apart = rest is not None and not torch.allclose(rest, known, atol=1e-3)  # a balanced prior rests at its edit
-        return {"edit": known, **({"fixed_point": rest} if apart else {}), "source": source}
+        if rest is None or torch.allclose(rest, known, atol=1e-3):  # a balanced prior rests at its edit
+            return {"edit": known, "source": source}
+        return {"edit": known, "fixed_point": rest, "source": source}
 
     def region(self, index: int) -> Tensor | None:
         """The thing itself where the truth is known, else what the mask lets change; None for an edit of everything."""
@@ -277,9 +283,10 @@ class EditMethod(Method):
             if index not in self._regions:
                 self._regions[index] = self.truth.region(self.draw, self.camera(index))
             return self._regions[index]
-        return None if self.source.region is None else self.source.view(index)[1].round()
+        share = self.source.view(index)[1]
+        return None if share is None else share.round()
 
-    def known_scenes(self) -> dict[str, Gaussians]:
+    def known_scenes(self) -> dict[str, Any]:
         return {"source": self.source.scene, **({} if self.truth is None else {"truth": self.truth.scene})}
 
     def panels(self, index: int) -> Panels:

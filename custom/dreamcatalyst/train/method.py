@@ -61,8 +61,10 @@ class Method:
     images it is measured: `first_scene`, `step_loss`, `references`.
 
     cfg: the system's config; part: its parsed sections; clock: of the run. context: set before anything is asked.
-    splats: None until `begin`. generations: of hierarchical splats, where a subclass keeps them.
+    generations: of hierarchical splats, where a subclass keeps them.
     """
+
+    context: Context
 
     title = "Splats from photographs"  # what the run is about, for its report
     pulled = False  # whether after_update moves splats by itself
@@ -70,9 +72,8 @@ class Method:
     def __init__(self, cfg: Any, part: MethodParts, clock: Clock):
         self.cfg, self.part, self.clock = cfg, part, clock
         self.draw, self.density = Drawer(part.renderer, clock), part.densify.make()
-        self.splats: Splats | None = None
         self.generations: Generations | None = None
-        self.context: Context | None = None
+        self._splats: Splats | None = None
 
     # --- to be said by subclasses
 
@@ -95,7 +96,7 @@ class Method:
     def timestep(self, step: int) -> int | None:
         """The prior's timestep at `step`, None where there is none."""
 
-    def known_scenes(self) -> dict[str, Gaussians]:
+    def known_scenes(self) -> dict[str, Any]:
         """Further scenes, by name, with which the splats' consistency between views is compared."""
         return {}
 
@@ -145,7 +146,7 @@ class Method:
     def begin(self) -> None:
         """Load the scene, where no checkpoint has brought one. Raises ConfigError, DataError and SceneError."""
         self.prepare()
-        if self.splats is None:
+        if self._splats is None:
             self.splats = self.make_splats(self.first_scene().to(self.context.device))
             self.density.begin(self.splats)
 
@@ -173,15 +174,23 @@ class Method:
         plan.leave_out("depth", "no output asks for it")
         return plan.finish(context.data.cfg.batch_size * size)
 
+    @property
+    def splats(self) -> Splats:
+        """The splats of the moment; there are some from `begin` on."""
+        if self._splats is None:
+            raise RuntimeError(f"{type(self).__name__} has not begun: it has no splats yet")
+        return self._splats
+
+    @splats.setter
+    def splats(self, splats: Splats) -> None:
+        self._splats = splats
+
     # --- views
 
     @property
     def capture(self) -> Capture:
         """The run's views."""
-        data = self.context.data
-        if data.capture is None:
-            data.open(self.splats.scene.detach() if self.splats else None, self.cfg.gs_source)
-        return data.capture
+        return self.context.data.open(self._splats.scene.detach() if self._splats else None, self.cfg.gs_source)
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -196,7 +205,7 @@ class Method:
     def photo(self, index: int) -> Tensor:
         """The photograph of one view, [H,W,3] in [0,1]; of a capture that carries splats, their render."""
 
-        def render(scene: Gaussians, camera: Cameras) -> Tensor:
+        def render(scene: Any, camera: Cameras) -> Tensor:
             return self.draw(scene.to(self.context.device), camera).rgb[0].clamp(0, 1)
 
         return self.capture.image(index, render)

@@ -47,7 +47,7 @@ class Meter:
         pace = f"{(now - then) / (n - before):.3g}" if n > before else "?"
         self.line = tqdm.format_meter(
             n,
-            self.total,
+            self.total,  # pyright: ignore[reportArgumentType]: tqdm takes None for an unknown one
             now - self.started,
             ncols=shutil.get_terminal_size().columns if self.terminal else None,
             prefix=self.name,

@@ -49,6 +49,8 @@ def restrict_to_mask(
     folder: where masks are kept for other runs. picture: the PNG that shows the mask in a few views.
     """
     scene, result = request.scene, make_mask(config, request, folder)
+    if result is None:  # of kind none
+        return scene, {}, None
     count = int(result.mask.sum())
     whole = count == len(scene)
     plugin.info(f"mask: {count} of {len(scene)} splats may change{', as without a mask' if whole else ''}")
