@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from dreamcatalyst import plugin
+from dreamcatalyst.config import check, load_config
 
 from benchmarks.tutorial import PICTURE, Block, blocks, run, script
 
@@ -88,6 +91,28 @@ def test_a_page_becomes_a_script():
     assert script(page).split() == ["set", "-euo", "pipefail", *light.replace("\\\n", "").split()]
     short = " ".join(script(page, 3).splitlines()[1].split())
     assert short == "python launch.py --config a.yaml b=1 trainer.max_steps=3 system.report.video_frames=0"
+
+
+def launches() -> list[tuple[str, list[str]]]:
+    """(page, arguments) of each call of the launcher on one of our configs, those that no test can run too. The page on
+    extending names parts of its own; it is run as a whole."""
+    found = []
+    for page in [page for page in PAGES if page.name != "extend.md"]:
+        for block in blocks(text(page)):
+            for line in block.text.replace("\\\n", " ").splitlines():
+                words = shlex.split(line, comments=True)
+                if "--config" in words and (ROOT / words[words.index("--config") + 1]).is_file():
+                    found.append((page.name, words[words.index("--config") + 1 :]))
+    return found
+
+
+@pytest.mark.parametrize(("page", "words"), launches(), ids=lambda value: value if isinstance(value, str) else value[0])
+def test_commands_name_registered_parts_and_valid_keys(page, words):
+    """All but the checkpoint, which an earlier command makes."""
+    given = [word for word in words[1:] if not word.startswith(("--", "resume="))]
+    config = load_config(ROOT / words[0], cli_args=given)
+    for key in ("data", "system"):
+        check(plugin.find(getattr(config, f"{key}_type")), getattr(config, key), key)
 
 
 @pytest.fixture
