@@ -24,11 +24,12 @@ import sys
 from pathlib import Path
 
 import yaml
+from omegaconf import OmegaConf
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "custom"))
 
-from dreamcatalyst.config import load_config  # noqa: E402
+from dreamcatalyst.config import load_config, read_yaml  # noqa: E402
 from dreamcatalyst.demo.capture import PREFIX  # noqa: E402
 from dreamcatalyst.errors import DreamCatalystError  # noqa: E402
 from dreamcatalyst.files import load  # noqa: E402
@@ -99,8 +100,8 @@ def masked(config: Path) -> bool:
 
 
 def read(config: Path) -> dict:
-    """A YAML as it stands."""
-    return yaml.safe_load(config.read_text(encoding="utf-8"))
+    """A config as it stands, over its base where it has one."""
+    return OmegaConf.to_container(read_yaml(config))
 
 
 def on_one_mask(config: Path, region: str, output: Path) -> Path:

@@ -460,11 +460,22 @@ def test_a_resumed_run_stays_in_its_trial(written, tmp_path):
     assert load_config(run, cli_args=[f"resume={elsewhere}"]).trial_name.startswith("a@")
 
 
-def test_the_experiment_has_the_hosts_fields():
+def test_the_experiment_has_the_hosts_fields_and_imports():
     names = {f for f in ExperimentConfig.__dataclass_fields__}
     assert names == {
         *("name", "description", "tag", "seed", "use_timestamp", "timestamp", "exp_root_dir", "exp_dir", "trial_name"),
-        *("trial_dir", "n_gpus", "resume", "data_type", "data", "system_type", "system", "trainer", "checkpoint"),
+        *(
+            "trial_dir",
+            "n_gpus",
+            "imports",
+            "resume",
+            "data_type",
+            "data",
+            "system_type",
+            "system",
+            "trainer",
+            "checkpoint",
+        ),
     }
 
 
@@ -488,3 +499,25 @@ def test_a_list_in_the_place_of_a_section_is_refused(tmp_path, given, said):
     with pytest.raises(ConfigError) as error:
         load_config(tmp_path / "a.yaml", cli_args=[given])
     assert said in str(error.value)
+
+
+def test_an_overlay_is_merged_over_its_base_wherever_it_lies(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "whole.yaml").write_text("name: whole\ntag: a\nsystem: {a: 1, b: {c: 2, d: given}}\n")
+    (tmp_path / "middle.yaml").write_text("base: whole.yaml\nname: middle\nsystem: {b: {c: 3}}\n")
+    (tmp_path / "sub/top.yaml").write_text("base: ../middle.yaml\nsystem: {a: 4, b: {d: '???'}}\n")
+    config = load_config(tmp_path / "sub/top.yaml", cli_args=["system.b.d=x"])
+    assert (config.name, config.tag) == ("middle", "a")
+    assert config.system == {"a": 4, "b": {"c": 3, "d": "x"}}
+    with pytest.raises(ConfigError, match="system.b.d: a value is needed"):
+        load_config(tmp_path / "sub/top.yaml")
+
+
+def test_bases_that_cannot_be_are_refused(tmp_path):
+    first, second = tmp_path / "first.yaml", tmp_path / "second.yaml"
+    first.write_text("base: second.yaml\ntag: a\n")
+    with pytest.raises(ConfigError, match=r"first.yaml: base: there is no file '.*second.yaml'"):
+        load_config(first)
+    second.write_text("base: first.yaml\n")
+    with pytest.raises(ConfigError, match=r"second.yaml: base: leads back .*first.yaml over .*second.yaml"):
+        load_config(first)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 import yaml
-from dreamcatalyst.config import load_config
+from dreamcatalyst.config import load_config, read_yaml
 from dreamcatalyst.errors import ConfigError
-from dreamcatalyst.guidance.rules import RULES
+from omegaconf import OmegaConf
 
 import launch
 from tests.diffusion.small_model import make_model
@@ -29,7 +30,7 @@ def models(tmp_path_factory):
 
 def overrides(path: str, models: dict[str, Path], folder: Path) -> list[str]:
     """What stands in for photographs, downloads and a GPU."""
-    config = yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
+    config = OmegaConf.to_container(read_yaml(ROOT / path))
     if config["data_type"] == "dreamcatalyst-prior-data":
         return [f"data.pairs={folder / 'pairs'}", "data.size=32", "system.autoencoder.crop=16"]
     words = config["system"].get("prompt_processor", {})
@@ -56,11 +57,14 @@ def test_every_config_runs_a_step(path, models, tmp_path):
     assert list(tmp_path.rglob("*.ply")) or list(tmp_path.rglob("*.safetensors"))
 
 
-def test_every_rule_has_a_config():
-    named = {path.stem for path in (ROOT / "configs/rules").glob("*.yaml")}
-    assert named == set(RULES.names()) - {"known-edit"}  # which is no method, but what methods are measured against
-    for path in (ROOT / "configs/rules").glob("*.yaml"):
-        assert yaml.safe_load(path.read_text())["system"]["guidance"]["rule"] == path.stem
+@pytest.mark.parametrize("psi", ["psi2", "psi3"])
+def test_a_config_that_restated_another_is_refused_with_what_says_the_same(psi):
+    with pytest.raises(ConfigError) as caught:
+        load_config(ROOT / f"configs/rules/dreamcatalyst-{psi}.yaml")
+    said = re.search("use (.*)\\.$", str(caught.value))[1].split()
+    words = ["data.source=x", "system.gs_source=x", "system.prompt_processor.prompt=x"]
+    config = load_config(ROOT / said[0], cli_args=[*said[1:], *words])
+    assert config.system["guidance"]["rule"] == f"dreamcatalyst-{psi}"
 
 
 @pytest.mark.parametrize("path, fast, high", [("dc-ge-ip2p", 1200, 1500), ("rules/pds", 1000, 3000)])

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 import yaml
 from dreamcatalyst import OFFERS, plugin
-from dreamcatalyst.config import ExperimentConfig, Range, check, load_config, missing_keys
+from dreamcatalyst.config import ExperimentConfig, Range, check, load_config, missing_keys, read_yaml
 from dreamcatalyst.diffusion.api import PRIORS
 from dreamcatalyst.segment.api import SEGMENTERS
+from omegaconf import OmegaConf
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "custom" / "dreamcatalyst"
@@ -168,7 +169,7 @@ def test_the_manifest_lists_the_configs(manifest):
 
 @pytest.mark.parametrize("path", [path for path in CONFIGS if path not in HOSTED])
 def test_every_config_names_registered_parts_and_valid_keys(path):
-    left_open = missing_keys(yaml.safe_load((ROOT / path).read_text(encoding="utf-8")))
+    left_open = missing_keys(OmegaConf.to_container(read_yaml(ROOT / path)))
     config = load_config(ROOT / path, cli_args=[f"{key}=given" for key in left_open])
     for key in ("data", "system"):
         name = getattr(config, f"{key}_type")
