@@ -45,6 +45,7 @@ def arguments(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
         "validate": "render and score the held-out views of a checkpoint (resume=) or PLY (system.gs_source=)",
         "test": "write the test-time pictures, video and tables of a checkpoint or PLY",
         "export": "write PLY and video from a checkpoint or PLY",
+        "print": "print the config, whole: with what it is laid over (base:) and all key=value; for threestudio, say",
         "preview": "the edit of a single view as the prior sees it, in seconds, before a long run is paid for",
     }.items():
         mode.add_argument(f"--{name}", dest="mode", action="store_const", const=name, help=text)
@@ -108,11 +109,16 @@ def link_into(host: Path) -> int:
 
 def run(args: argparse.Namespace, overrides: list[str], stop: Any) -> int:
     """Load the config, build data and system, and hand them to Lightning. stop: the Stop that takes the signals."""
-    from dreamcatalyst.config import merge_config, read_config
+    from dreamcatalyst.config import merge_config, merge_open, read_config
     from dreamcatalyst.imports import import_parts
 
     if args.gpu is not None:
         os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(args.gpu))  # read by torch, which is not imported yet
+    if args.mode == "print":
+        from omegaconf import OmegaConf
+
+        print(OmegaConf.to_yaml(merge_open(args.config, cli_args=overrides)), end="")
+        return 0
     merged = merge_config(args.config, cli_args=overrides)
     config = read_config(merged, lambda: keys_below(merged))
     import_parts(config.imports)

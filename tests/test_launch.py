@@ -343,3 +343,13 @@ def test_where_links_cannot_be_made_a_copy_takes_their_place(tmp_path, capsys, m
     assert "is a copy, since no link can be made there" in capsys.readouterr().out
     assert (host / "custom/dreamcatalyst/plugin.py").is_file()
     assert launch.main(["--link", str(host)]) == 0  # the same contents: nothing to do
+
+
+def test_a_config_is_printed_whole(tmp_path, capsys):
+    """What threestudio can read: no base, all that the base has, and what is left to the user still open."""
+    assert launch.main(["--config", str(ROOT / "configs/rules/pds.yaml"), "--print", "system.guidance.gap=1"]) == 0
+    whole = tmp_path / "whole.yaml"
+    whole.write_text(capsys.readouterr().out)
+    config = yaml.safe_load(whole.read_text())
+    assert "base" not in config and config["system"]["guidance"]["gap"] == 1 and config["data"]["source"] == "???"
+    assert config["trainer"]["max_steps"] == "${system.steps.${system.mode}}"  # not resolved: keys can still be given

@@ -1,7 +1,7 @@
 """Typed configs: what a YAML may say, and the run that it describes."""
 
 from .experiment import ExperimentConfig
-from .merge import merge_config, missing_keys, read_yaml
+from .merge import merge_config, merge_open, missing_keys, read_yaml
 from .parse import check, known_keys, parse
 from .read import load_config, read_config, save_config
 from .schedules import corners, largest, value
@@ -50,6 +50,7 @@ __all__ = [
     "largest",
     "load_config",
     "merge_config",
+    "merge_open",
     "missing_keys",
     "parse",
     "read_config",

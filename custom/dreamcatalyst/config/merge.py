@@ -28,13 +28,18 @@ GONE = {  # configs that restated another one: file to what says the same
 
 def merge_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: Any) -> DictConfig:
     """YAML files merged from left to right, then `key.sub=value` arguments, then `overrides`; nothing is resolved, so
-    that what follows from another key still does. Raises ConfigError."""
-    _register_resolvers()
-    parts = [*(read_yaml(Path(path)) for path in yamls), _dotlist(cli_args), OmegaConf.create(overrides)]
-    merged = functools.reduce(_merged, parts)
+    that what follows from another key still does. Raises ConfigError, also for a value that is left to the user."""
+    merged = merge_open(*yamls, cli_args=cli_args, **overrides)
     for key in missing_keys(OmegaConf.to_container(merged)):
         raise ConfigError(f"{key}: a value is needed, and none is given. Add {key}=... to the command.")
     return merged
+
+
+def merge_open(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: Any) -> DictConfig:
+    """`merge_config`, in which values may still be left to the user."""
+    _register_resolvers()
+    parts = [*(read_yaml(Path(path)) for path in yamls), _dotlist(cli_args), OmegaConf.create(overrides)]
+    return functools.reduce(_merged, parts)
 
 
 def _merged(below: DictConfig, above: DictConfig) -> DictConfig:
