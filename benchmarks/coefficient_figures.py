@@ -3,6 +3,7 @@
     python benchmarks/coefficient_figures.py [--out docs/coefficients.png] [--gap 2]
 
 prints the curves at some timesteps and draws them all in the order in which a run takes them: noise falls to the right.
+It needs matplotlib: pip install ".[benchmarks]"
 """
 
 from __future__ import annotations
@@ -34,13 +35,16 @@ PANELS = {  # title -> (label, rule, weight, colour, line)
 }
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "coefficients.png")
     parser.add_argument("--gap", type=int, default=2, help="timesteps between the two steps of PDS: 2 as published")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
 
-    import matplotlib
+    try:
+        import matplotlib
+    except ImportError as error:
+        sys.exit(f'the figures need matplotlib, which cannot be imported: {error}. Remedy: pip install ".[benchmarks]"')
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
