@@ -2,6 +2,9 @@
 
 A pattern search on a grid of powers (Hooke & Jeeves 1961): from the best point so far, neighbours are tried until the
 trials are spent, or none is left.
+
+Not a library's search: optuna's samplers fit a model to the scores, and three to five trials give it too little to fit.
+These points need no seed and follow from the trials before them alone, so that a table goes on from any of its rows.
 """
 
 from __future__ import annotations
