@@ -1,6 +1,7 @@
 """Mistakes, planted one at a time in a copy of the tree, that its tests must see: python benchmarks/mutations.py
 
-Prints, for each mutation, the tests that fail; the exit status is 1 where one is not seen. --only takes some by words
+First all tests that are to see something run without a mutation: what fails then says nothing, and is left out. Prints,
+for each mutation, the tests that fail; the exit status is 1 where one is not seen. --only takes some by words
 of their names, --tree another checkout (of an earlier commit, say), --whole runs all tests of the tree, to their end.
 """
 
@@ -166,15 +167,15 @@ def copy_of(tree: Path, folder: Path) -> Path:
     return Path(shutil.copytree(tree, folder, ignore=ignore, symlinks=True))
 
 
-def failures(tree: Path, mutation: Mutation | None, whole: bool) -> list[str]:
-    """Tests that fail with the mutation; the first one, unless the whole suite is run. Raises LookupError for a text or
-    a test that is not there, RuntimeError where the tests did not run."""
+def failures(tree: Path, mutation: Mutation | None, asked: list[str], left_out: list[str]) -> list[str]:
+    """Tests that fail with the mutation, or without any. asked: what pytest is to run; left_out: tests that are not to.
+    Raises LookupError for a text that is not there, RuntimeError where the tests did not run."""
     with tempfile.TemporaryDirectory(prefix="mutation-") as temporary:
         copy = copy_of(tree, Path(temporary) / "tree")
         (Path(temporary) / "shared").symlink_to(tree.parent / "shared")  # captures, for the tests that have some
-        file = place(copy, mutation.old)
-        file.write_text(file.read_text(encoding="utf-8").replace(mutation.old, mutation.new), encoding="utf-8")
-        asked = [] if whole else ["-x", *test_files(copy, mutation.tests)]
+        if mutation is not None:
+            file = place(copy, mutation.old)
+            file.write_text(file.read_text(encoding="utf-8").replace(mutation.old, mutation.new), encoding="utf-8")
         one = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         command = [
             sys.executable,
@@ -186,11 +187,12 @@ def failures(tree: Path, mutation: Mutation | None, whole: bool) -> list[str]:
             "-o",
             "addopts=--import-mode=importlib",
         ]
+        command += [f"--deselect={name}" for name in left_out]
         done = subprocess.run([*command, *asked], cwd=copy, capture_output=True, text=True, env=os.environ | one)
     found = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, flags=re.MULTILINE)
     if done.returncode not in (0, 1) and not found:
         raise RuntimeError(
-            f"{mutation.name}: pytest ended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+            f"{mutation.name if mutation else 'no mutation'}: pytest ended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
         )
     return found
 
@@ -204,12 +206,20 @@ def main() -> int:
     args = parser.parse_args()
     chosen = [m for m in MUTATIONS if not args.only or any(word in m.name for word in args.only)]
     tree = args.tree.resolve()
+    asked = {}
     for mutation in chosen:
-        place(tree, mutation.old), test_files(tree, mutation.tests)
+        place(tree, mutation.old)
+        asked[mutation] = [] if args.whole else ["-x", *test_files(tree, mutation.tests)]
+    every = sorted({name for names in asked.values() for name in names if name != "-x"})
+    already = failures(tree, None, every, [])
+    if already:
+        print(f"fail without a mutation, and are left out: {', '.join(already)}\n")
     print("| mutation | tests that fail |\n|---|---|", flush=True)
     unseen = 0
     with ThreadPoolExecutor(args.jobs) as pool:
-        for mutation, found in zip(chosen, pool.map(lambda m: failures(tree, m, args.whole), chosen), strict=True):
+        for mutation, found in zip(
+            chosen, pool.map(lambda m: failures(tree, m, asked[m], already), chosen), strict=True
+        ):
             print(f"| {mutation.name} | {', '.join(found) or 'NONE'} |", flush=True)
             unseen += not found
     print(f"\n{len(chosen)} mutations: {len(chosen) - unseen} seen, {unseen} not")
