@@ -191,9 +191,9 @@ def failures(tree: Path, mutation: Mutation | None, asked: list[str], left_out: 
         done = subprocess.run([*command, *asked], cwd=copy, capture_output=True, text=True, env=os.environ | one)
     found = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, flags=re.MULTILINE)
     if done.returncode not in (0, 1) and not found:
-        raise RuntimeError(
-            f"{mutation.name if mutation else 'no mutation'}: pytest ended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
-        )
+        what = mutation.name if mutation else "no mutation"
+        end = f"{done.stdout[-2000:]}{done.stderr[-2000:]}"
+        raise RuntimeError(f"{what}: pytest ended with {done.returncode}:\n{end}")
     return found
 
 
