@@ -94,6 +94,7 @@ def test_schedules_go_as_published(mode, steps, times, last):
     assert (densify.every, densify.start, densify.times(steps)) == (100, 100, times)
 
 
+@pytest.mark.usefixtures("unchecked")  # no splats: weights alone
 def test_the_first_generation_is_held_as_published():
     """0.05 * 1.3^12 = 1.165 after twelve densifications."""
     system = loaded().system
