@@ -4,12 +4,12 @@ CPU's."""
 from __future__ import annotations
 
 import pytest
-from dreamcatalyst.guidance import host
 from dreamcatalyst.guidance.guidance import Guidance
-from tests.guidance.test_host_guidance import WORDS, Processor, loss_of, made, picture
+from dreamcatalyst.host import guidance as host
 
 from tests.device.far import FAR, Far, install
 from tests.diffusion.small_model import make_model
+from tests.test_host_guidance import WORDS, Processor, loss_of, made, picture
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
