@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from .. import plugin
 
@@ -19,7 +19,14 @@ _CACHE = Path(numba.config.CACHE_DIR or _FOLDER / "__pycache__") / f"kernels-{_D
 
 
 class Cache(FunctionCache):
-    """numba's cache of one function, which a damaged file does not stop."""
+    """numba's cache of one function, which a damaged file does not stop, and which is valid wherever the file stands:
+    numba's own goes by its path and time, and a link to this package, or a copy, would compile everything anew."""
+
+    def __init__(self, function: Callable):
+        super().__init__(function)
+        if Path(self._cache_path).is_relative_to(_CACHE):  # and not where numba looks when that cannot be written to
+            self._cache_path = str(_CACHE)
+            self._cache_file = IndexDataCacheFile(self._cache_path, self._impl.filename_base, _DIGEST)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled function for a signature; None, and so compiled anew, where there is none that can be read."""
