@@ -120,7 +120,7 @@ def _recentred(shots: list[Shot], points: Points | None) -> tuple[list[Shot], Po
 
 
 def _view(shot: Shot, options: CaptureOptions) -> View:
-    lens = shot.lens if shot.path is None else _at_file_size(shot)
+    lens = shot.lens if shot.path is None else _at_file_size(shot.lens, shot.path)
     if shot.path is not None:
         each, size = UNDISTORTED if lens.distorted else DECODED, f"{lens.width}x{lens.height}"
         require_memory(lens.width * lens.height * each, f"{shot.path}: {size} pixels", "Make smaller copies")
@@ -134,13 +134,12 @@ def _view(shot: Shot, options: CaptureOptions) -> View:
     return View(shot.name, camera.to(dtype=torch.float32), photo)
 
 
-def _at_file_size(shot: Shot) -> Lens:
+def _at_file_size(lens: Lens, path: Path) -> Lens:
     """The lens at the size of the image file, which may be a smaller copy (images_4) but not of another shape."""
-    width, height = image_size(shot.path)
-    lens = shot.lens
+    width, height = image_size(path)
     if abs(width * lens.height - height * lens.width) > 1.5 * max(lens.width, lens.height):  # 1.5 px: rounded copies
         turned = abs(width * lens.width - height * lens.height) <= 1.5 * max(lens.width, lens.height)
         hint = " It lies on its side: reconstruct with EXIF orientation removed." if turned else ""
         shapes = f"is {width}x{height}, which is not the shape of its camera, {lens.width}x{lens.height}"
-        raise DataError(f"{shot.path}: {shapes}.{hint}")
+        raise DataError(f"{path}: {shapes}.{hint}")
     return lens.scaled(width, height)

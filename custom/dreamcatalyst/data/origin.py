@@ -21,4 +21,5 @@ def far_origin(positions: np.ndarray) -> Origin:
     spread = float(np.median(np.linalg.norm(positions - middle, axis=1)))
     if spread == 0.0 or not np.linalg.norm(middle) > FAR * spread:
         return ZERO
-    return tuple(float(value) for value in np.round(middle))
+    x, y, z = np.round(middle).tolist()
+    return x, y, z

@@ -22,11 +22,12 @@ def fit(width: int, height: int, options: CaptureOptions) -> tuple[tuple[int, in
     """The window (left, top, width, height) of an image that is shown, and the width and height it is resized to.
 
     Raises DataError for a size that memory does not hold."""
-    window, *size = _fit(width, height, options)
-    if max(size) > LONGEST:
-        raise DataError(f"data: views of {size[0]}x{size[1]} pixels, expected {LONGEST} a side at most. {SMALLER}.")
-    require_memory(size[0] * size[1] * DRAWN, f"data: views of {size[0]}x{size[1]} pixels", SMALLER)
-    return window, *size
+    window, width, height = _fit(width, height, options)
+    views = f"data: views of {width}x{height} pixels"
+    if max(width, height) > LONGEST:
+        raise DataError(f"{views}, expected {LONGEST} a side at most. {SMALLER}.")
+    require_memory(width * height * DRAWN, views, SMALLER)
+    return window, width, height
 
 
 def _fit(width: int, height: int, options: CaptureOptions) -> tuple[tuple[int, int, int, int], int, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -111,15 +111,16 @@ def _lens(meta: dict[str, Any], where: str, photo: Path) -> Lens:
     meta = {key: _number(value, key, where, NUMBERS[key]) for key, value in meta.items() if key in NUMBERS}
     width, height = int(meta.get("w", size[0])), int(meta.get("h", size[1]))
     fx, fy = _focal(meta, "x", width), _focal(meta, "y", height)
-    if fx is None and fy is None:
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    if fx is None or fy is None:
         raise DataError(f"{where} has no 'fl_x' (nor 'camera_angle_x'), and neither has the whole file")
     k1, k2, k3, k4, p1, p2 = (meta.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     fisheye = model in FISHEYE
     if k4 and not fisheye:
         raise DataError(f"{where}: k4={k4} belongs to OPENCV_FISHEYE, the camera model is {model}")
     return Lens(
-        fx=fx if fx is not None else fy,
-        fy=fy if fy is not None else fx,
+        fx=fx,
+        fy=fy,
         cx=meta.get("cx", width / 2),
         cy=meta.get("cy", height / 2),
         width=width,
@@ -172,7 +173,7 @@ def _points(path: Path, meta: dict) -> Points | None:
     if not there(cloud_path):
         raise DataError(f"{path}: its ply_file_path {cloud_path} is missing; remove the key to do without points")
     try:
-        cloud = trimesh.load(cloud_path)
+        cloud = cast(Any, trimesh.load(cloud_path))  # of one of several kinds
         xyz = np.array(cloud.vertices, np.float64)
     except Exception as error:  # each of trimesh's readers raises its own kinds
         raise DataError(f"{cloud_path}: cannot be read as a point cloud ({type(error).__name__}: {error})") from error

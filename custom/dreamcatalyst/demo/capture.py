@@ -38,7 +38,8 @@ def scan_world(world: World) -> Scan:
 
 def _shot(index: int, cameras: Cameras) -> Shot:
     K = cameras.Ks[index].double()
-    lens = Lens(*(float(K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))), cameras.width, cameras.height)
+    fx, fy, cx, cy = (float(K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    lens = Lens(fx, fy, cx, cy, cameras.width, cameras.height)
     return Shot(f"{index:04d}", cameras.viewmats[index].double().numpy().astype(np.float64), lens, None)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,7 +107,7 @@ def shard_pairs(seed: int, index: int, size: int, images: list[ndarray], operato
     """The pairs of one shard, without end: the first n are the same whatever is taken."""
     rng = np.random.default_rng([seed, index])
     while True:
-        if images and rng.random() < PHOTOGRAPHED:
+        if images and operators and rng.random() < PHOTOGRAPHED:
             yield from photograph_pairs(images, operators, size, rng)
         else:
             yield from world_pairs(random_world(int(rng.integers(HELD_OUT, 2**31)), CAMERAS, size), rng)
@@ -172,8 +173,9 @@ def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs
     for i in missing:
         stream = shard_pairs(seed, i, size, images, photographs)
         pairs = [pair for _, pair in zip(range(wanted[i]), stream, strict=False)]
+        arrays: dict[str, Any] = {key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]}
         with replacing(files[i]) as part, part.open("wb") as out:
-            np.savez(out, **{key: np.stack([np.asarray(pair[key]) for pair in pairs]) for key in pairs[0]})
+            np.savez(out, **arrays)
 
 
 def read_pairs(folder: Path) -> dict[str, ndarray]:

@@ -116,11 +116,11 @@ def disc(center: Sequence[float], radius: float, n: int) -> tuple[Tensor, Tensor
 def plane(center: Sequence[float], right: Sequence[float], up: Sequence[float], spacing: float) -> tuple[Tensor, ...]:
     """Points, normals and widths of a rectangle: `right` and `up` lead from its centre to the middles of two sides;
     its normal is right x up."""
-    center, right, up = (torch.tensor(v, dtype=torch.float32) for v in (center, right, up))
-    n, m = (max(2, round(2 * float(v.norm()) / spacing)) for v in (right, up))
+    middle, x, y = (torch.tensor(v, dtype=torch.float32) for v in (center, right, up))
+    n, m = (max(2, round(2 * float(v.norm()) / spacing)) for v in (x, y))
     a, b = torch.meshgrid((torch.arange(n) + 0.5) / n * 2 - 1, (torch.arange(m) + 0.5) / m * 2 - 1, indexing="ij")
-    points = center + a.reshape(-1, 1) * right + b.reshape(-1, 1) * up
-    normal = torch.nn.functional.normalize(torch.linalg.cross(right, up), dim=0)
+    points = middle + a.reshape(-1, 1) * x + b.reshape(-1, 1) * y
+    normal = torch.nn.functional.normalize(torch.linalg.cross(x, y), dim=0)
     return points, normal.repeat(n * m, 1), points.new_full((n * m,), 0.65 * OVERLAP * spacing)
 
 

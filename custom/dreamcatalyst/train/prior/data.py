@@ -6,17 +6,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from ... import plugin
 from ...config import AtLeastOne, Seed, Side, parse
 from ...data.views import views_for_step
-from ...demo.pairs import make_pairs, read_pairs
+from ...demo.pairs import Operators, make_pairs, read_pairs
 from ...demo.photographs import PHOTOGRAPHS
 from ...diffusion.operators import find_operator
 from ...errors import ConfigError, DataError
@@ -90,7 +90,8 @@ class PriorData(plugin.pl.LightningDataModule):
         """Make the pairs that are not there yet. A folder without pairs.json holds somebody's own and is left alone."""
         if (self.folder / "pairs.json").exists() or not any(self.folder.glob("pairs-*.npz")):
             plugin.info(f"pairs: {self.folder}, made where they are not there yet")
-            operators = find_operator if self.cfg.photographs and not self.trial else None
+            known = cast(Operators, find_operator)  # no edit's name is empty, for which it gives None
+            operators = known if self.cfg.photographs and not self.trial else None
             make_pairs(self.folder, self.count, self.cfg.seed, size=self.cfg.size, photographs=operators)
 
     @property
@@ -167,7 +168,8 @@ class PriorData(plugin.pl.LightningDataModule):
 
     def _held_out(self) -> DataLoader:
         parts = np.array_split(self.held_out, -(-len(self.held_out) // 8))
-        return DataLoader([{"index": part.tolist()} for part in parts], batch_size=None)
+        batches = [{"index": part.tolist()} for part in parts]
+        return DataLoader(cast(Dataset, batches), batch_size=None)  # it asks for a length and items
 
     def val_dataloader(self) -> DataLoader:
         return self._held_out()

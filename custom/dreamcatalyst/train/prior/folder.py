@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
-from torch import nn
 
-from .models import TIMESTEPS
+from .models import TIMESTEPS, Networks
 from .vocabulary import write_tokenizer
 
 PIPELINE = "StableDiffusionInstructPix2PixPipeline"
@@ -88,7 +87,7 @@ OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR
 
 def write_prior(
     folder: Path,
-    networks: Mapping[str, nn.Module],
+    networks: Networks,
     merges: list[tuple[str, str]],
     latent_std: float,
     instructions: Mapping[str, Sequence[str]],
@@ -112,7 +111,7 @@ def write_prior(
     length = networks["text_encoder"].config.max_position_embeddings
     write_tokenizer(folder / "tokenizer", merges, length)
     facts = {
-        "megabytes": sum(p.numel() for network in networks.values() for p in network.parameters()) * 2 / 1e6,
+        "megabytes": sum(p.numel() for _, network in networks.items() for p in network.parameters()) * 2 / 1e6,
         "size": networks["vae"].config.sample_size,
         "edits": textwrap.fill(", ".join(sorted(instructions)), 118),
         "scheduler": f"{SCHEDULER['beta_schedule']}, {SCHEDULER['prediction_type']}",

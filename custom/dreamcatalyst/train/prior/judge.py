@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...config import AtLeastOne, Count, DdimSteps, Number
 from ...diffusion.api import Prior
+from ...diffusion.ip2p import InstructPix2Pix
 from ...diffusion.noise import keyed_noise
 from ...guidance.ddim import edit_image
 from ...report.metrics import METRICS
@@ -79,7 +80,7 @@ def scores(candidates: Mapping[str, Tensor], truth: Tensor, mask: Tensor) -> dic
 
 
 def judge_pairs(
-    prior: Prior, pairs: Pairs, index: Sequence[int], config: SamplesConfig, seed: int = 0
+    prior: InstructPix2Pix, pairs: Pairs, index: np.ndarray | list[int], config: SamplesConfig, seed: int = 0
 ) -> dict[str, Any]:
     """Some of `pairs` and what `prior` makes of them: edit [B] names, instruction [B], source, truth, made
     [B,3,H,W], and the `scores` of leaving the source alone ("unedited"), of the edit, and of the "bound"."""
@@ -131,9 +132,9 @@ def edit_rows(judged: Mapping[str, Any]) -> list[Row]:
 
 @torch.no_grad()
 def reconstruction_rows(
-    vae: nn.Module, pairs: Pairs, index: Sequence[int], device: torch.device
+    vae: Any, pairs: Pairs, index: np.ndarray | list[int], device: torch.device
 ) -> tuple[list[Row], float]:
-    """Sources and edited images of pairs, each beside what the autoencoder makes of it, and the mean PSNR in dB."""
+    """Sources and edited images of pairs, each beside what `vae`, an AutoencoderKL, makes of it; mean PSNR in dB."""
     rows, psnr = [], []
     for i in index:
         images = torch.cat([pairs.images(kind, [i]) for kind in ("source", "edited")]).to(device)

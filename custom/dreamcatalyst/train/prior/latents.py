@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ... import files, plugin
 from ...errors import FileError
@@ -18,9 +19,9 @@ KINDS = ("source", "edited")
 
 
 @torch.no_grad()
-def encode_pairs(vae: nn.Module, pairs: Pairs, device: torch.device) -> dict[str, Tensor]:
+def encode_pairs(vae: Any, pairs: Pairs, device: torch.device) -> dict[str, Tensor]:
     """The posterior's mode of all n pairs and of their mirror images, unscaled, as "source" and "edited": float16
-    [2n,C,h,w] on the CPU, pair i at i and mirrored at n + i."""
+    [2n,C,h,w] on the CPU, pair i at i and mirrored at n + i. vae: an AutoencoderKL."""
     n = len(pairs)
     meter = Meter("encode", 4 * n, "image", passing=True)
     made: dict[str, Tensor] = {}
@@ -37,7 +38,7 @@ def encode_pairs(vae: nn.Module, pairs: Pairs, device: torch.device) -> dict[str
     return made
 
 
-def cached_latents(file: Path, vae: nn.Module, pairs: Pairs, device: torch.device) -> dict[str, Tensor]:
+def cached_latents(file: Path, vae: Any, pairs: Pairs, device: torch.device) -> dict[str, Tensor]:
     """`encode_pairs`, or what it gave before for the same weights and the same pairs, from `file`."""
     key = _key(vae, pairs)
     if file.exists():
@@ -53,7 +54,7 @@ def cached_latents(file: Path, vae: nn.Module, pairs: Pairs, device: torch.devic
     return made
 
 
-def _key(vae: nn.Module, pairs: Pairs) -> str:
+def _key(vae: Any, pairs: Pairs) -> str:
     digest = hashlib.blake2b(digest_size=16)
     for value in vae.state_dict().values():
         digest.update(value.cpu().contiguous().numpy().tobytes())

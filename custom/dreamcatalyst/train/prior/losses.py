@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
+
+from .models import Networks
 
 SCALES = 4  # halvings of an image, at most, at which its error is seen again
 
@@ -34,7 +36,7 @@ def noised(clean: Tensor, noise: Tensor, abar: Tensor) -> tuple[Tensor, Tensor]:
     return signal * clean + sigma * noise, signal * noise - sigma * clean
 
 
-def unet_loss(networks: Mapping[str, nn.Module], abar: Tensor, inputs: Sequence[Tensor], rows: slice) -> Tensor:
+def unet_loss(networks: Networks, abar: Tensor, inputs: Sequence[Tensor], rows: slice) -> Tensor:
     """What `rows` of a batch add to its mean squared error in v (Salimans & Ho 2022), unweighted: what an instruction
     asks for is decided at high noise, where weights by the signal-to-noise ratio all but vanish.
 

@@ -6,9 +6,10 @@ transformers, so that what is trained here loads wherever the large model does.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
-from typing import Annotated
+from typing import Annotated, Any, Protocol
 
 import torch
 from torch import nn
@@ -19,6 +20,14 @@ from ...errors import ConfigError
 LATENTS = 4  # channels of a latent; the U-Net takes the noisy one and the image's
 TIMESTEPS = 1000
 MEGABYTES = 24  # of weights in half precision, at most: what a repository may carry
+
+
+class Networks(Protocol):
+    """vae, text_encoder and unet by name, of the classes of diffusers and transformers (an nn.ModuleDict of them)."""
+
+    def __getitem__(self, key: str, /) -> Any: ...
+
+    def items(self) -> Iterable[tuple[str, Any]]: ...
 
 
 @dataclass(frozen=True)
@@ -109,10 +118,13 @@ def make_autoencoder(config: AutoencoderConfig, size: int) -> nn.Module:
     from diffusers import AutoencoderKL
 
     levels = len(config.channels)
-    vae = AutoencoderKL(
+    by_level: dict[str, Any] = dict(  # which diffusers annotates as tuples of one
         block_out_channels=config.channels,
         down_block_types=("DownEncoderBlock2D",) * levels,
         up_block_types=("UpDecoderBlock2D",) * levels,
+    )
+    vae = AutoencoderKL(
+        **by_level,
         layers_per_block=config.layers,
         norm_num_groups=config.groups,
         latent_channels=LATENTS,
@@ -140,8 +152,8 @@ def begin_with_colours(vae: nn.Module) -> None:
             _pass_on(conv, centre, gain=2.0)  # after a SiLU, whose slope at zero is a half
 
 
-def _pass_on(conv: nn.Module, taps: tuple[tuple[int, int], ...], gain: float = 1.0) -> None:
-    """Make the first three channels of a convolution those of its input, as the mean over `taps` (row, column)."""
+def _pass_on(conv: Any, taps: tuple[tuple[int, int], ...], gain: float = 1.0) -> None:
+    """Make the first three channels of an nn.Conv2d those of its input, as the mean over `taps` (row, column)."""
     conv.weight[:3] = 0
     conv.bias[:3] = 0
     for channel, (row, column) in product(range(3), taps):
@@ -188,7 +200,7 @@ def make_unet(config: UnetConfig, text: TextConfig, size: int) -> nn.Module:
 
 def make_networks(
     autoencoder: AutoencoderConfig, text: TextConfig, unet: UnetConfig, size: int, vocabulary: int, seed: int
-) -> nn.ModuleDict:
+) -> Networks:
     """vae, text_encoder and unet with weights drawn from `seed`. Raises ConfigError where they would be too large."""
     if size % autoencoder.factor or size // autoencoder.factor % 2 ** (len(unet.channels) - 1):
         raise ConfigError(f"data.size: got {size}, which {len(unet.channels)} levels of the U-Net cannot halve evenly")

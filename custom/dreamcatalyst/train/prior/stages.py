@@ -31,7 +31,7 @@ class Progress:
         by_time = self.seconds / 60 / stage.minutes if stage.minutes else 0.0
         return min(max((step - self.first) / stage.steps, by_time), 1.0)
 
-    def steps(self, step: int, end: int | None) -> int:
+    def steps(self, step: int, end: int | None = None) -> int:
         """How many steps were done by the run's `step`, where the stage was over at `end` (None: it is not)."""
         return 0 if self.first is None else (step if end is None else end) - self.first
 

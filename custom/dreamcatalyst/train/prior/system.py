@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -27,7 +28,7 @@ from .folder import write_prior
 from .judge import SamplesConfig, edit_rows, judge_pairs, reconstruction_rows, score_table, sheet
 from .latents import cached_latents
 from .losses import reconstruction_loss, unet_loss
-from .models import TIMESTEPS, AutoencoderConfig, TextConfig, UnetConfig, make_networks
+from .models import TIMESTEPS, AutoencoderConfig, Networks, TextConfig, UnetConfig, make_networks
 from .stages import STAGES, Progress, cosine, unet_inputs
 from .vocabulary import Tokens, learn_merges, unknown_words, vocabulary
 
@@ -52,6 +53,9 @@ class PriorSystem(System):
         samples: SamplesConfig
 
     part: Parts
+    networks: Networks  # from `setup` on, as is `ema`
+    ema: Networks
+    latents: Mapping[str, Tensor]  # of all pairs, in the second stage
 
     @dataclass
     class Config(System.Config):
@@ -70,14 +74,12 @@ class PriorSystem(System):
     def configure(self) -> None:
         super().configure()
         self.progress = {name: Progress() for name in STAGES}
-        self.networks: nn.ModuleDict | None = None
-        self.latents: dict[str, Tensor] | None = None
         self._loss: float | None = None  # smoothed
         self._workers: ThreadPoolExecutor | None = None
         self._outcomes: list[dict[str, Any]] = []
 
     def setup(self, stage: str) -> None:
-        if self.networks is not None:
+        if hasattr(self, "networks"):
             return
         self._make_networks(learn_merges(self.data.pairs.instruction))
         self.register_buffer("latent_std", torch.ones(()))
@@ -88,9 +90,10 @@ class PriorSystem(System):
         part, self.merges = self.part, merges
         size, tokens = self.data.cfg.size, len(vocabulary(merges))
         self.networks = make_networks(part.autoencoder, part.text, part.unet, size, tokens, self.cfg.seed)
-        self.ema = copy.deepcopy(self.networks).requires_grad_(False)
-        for network in (self.networks, self.ema):
-            network.to(memory_format=torch.channels_last)
+        self.ema = copy.deepcopy(self.networks)
+        for name, kept in self.ema.items():
+            self.networks[name].to(memory_format=torch.channels_last)
+            kept.requires_grad_(False).to(memory_format=torch.channels_last)
 
     @cached_property
     def token_ids(self) -> Tokens:
@@ -102,8 +105,10 @@ class PriorSystem(System):
         return self.trainer.datamodule
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        options = dict(betas=(0.9, 0.99), weight_decay=0.01)
-        return [torch.optim.AdamW(self.trained(name), lr=self.of(name).learning_rate, **options) for name in STAGES]
+        return [
+            torch.optim.AdamW(self.trained(name), self.of(name).learning_rate, betas=(0.9, 0.99), weight_decay=0.01)
+            for name in STAGES
+        ]
 
     # --- training
 
@@ -122,7 +127,7 @@ class PriorSystem(System):
         stage, step = self.stage, batch["step"]
         config, progress = self.of(stage), self.progress[stage]
         done = progress.at(step, config)
-        number = step - progress.first
+        number = progress.steps(step)
         optimizer = self.optimizers()[list(STAGES).index(stage)]
         rate = config.learning_rate * min(1.0, (number + 1) / max(config.warm_up, 1)) * cosine(done)
         for group in optimizer.param_groups:
@@ -141,7 +146,7 @@ class PriorSystem(System):
         self._loss = value if self._loss is None else 0.98 * self._loss + 0.02 * value
         progress.seconds += time.perf_counter() - started
 
-    def trained(self, stage: str) -> list[nn.Parameter]:
+    def trained(self, stage: str) -> list[Tensor]:
         """What trains in a stage."""
         return [p for name in STAGES[stage] for p in self.networks[name].parameters()]
 
@@ -235,7 +240,7 @@ class PriorSystem(System):
         write_png(self.path(f"it{step}-{self.stage}.png"), sheet(rows))
         plugin.info(f"step {step}, {self.stage}: {decibel:.2f} dB on held-out pairs")
 
-    def _judge(self, prior: InstructPix2Pix, index: Sequence[int]) -> dict[str, Any]:
+    def _judge(self, prior: InstructPix2Pix, index: np.ndarray | list[int]) -> dict[str, Any]:
         return judge_pairs(prior, self.data.pairs, index, self.part.samples, self.cfg.seed)
 
     def on_test_start(self) -> None:

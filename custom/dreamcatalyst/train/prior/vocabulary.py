@@ -56,7 +56,7 @@ def learn_merges(texts: Iterable[str]) -> list[tuple[str, str]]:
     )
     tokenizer.train_from_iterator(words, trainer)
     merges = json.loads(tokenizer.to_str())["model"]["merges"]
-    return [tuple(pair.split(" ") if isinstance(pair, str) else pair) for pair in merges]
+    return [(a, b) for a, b in (pair.split(" ") if isinstance(pair, str) else pair for pair in merges)]
 
 
 def unknown_words(texts: Iterable[str], merges: Iterable[tuple[str, str]]) -> list[str]:
