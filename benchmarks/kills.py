@@ -27,7 +27,7 @@ from dreamcatalyst import files  # noqa: E402
 from dreamcatalyst.demo.worlds import make_world  # noqa: E402
 from dreamcatalyst.scene.ply import write_ply  # noqa: E402
 
-PRELOAD = ["launch", "dreamcatalyst.train.edit", "dreamcatalyst.train.datamodule", "dreamcatalyst.render.cpu"]
+PRELOAD = ["launch", "dreamcatalyst.train.edit", "dreamcatalyst.train.datamodule", "dreamcatalyst.render.cpu.api"]
 PRELOAD += ["lightning.pytorch", "dreamcatalyst.train.keeper", "dreamcatalyst.train.progress"]
 STEPS = 40
 WAIT = 120.0  # seconds after which a life that does nothing is given up

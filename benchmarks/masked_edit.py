@@ -19,7 +19,7 @@ from torch import Tensor
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parent.parent / "custom")]
 
 from dreamcatalyst.data.camera import Cameras  # noqa: E402
-from dreamcatalyst.render.frozen import Frozen  # noqa: E402
+from dreamcatalyst.render.api import Frozen  # noqa: E402
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians  # noqa: E402
 from dreamcatalyst.scene.generations import Generations  # noqa: E402
 from dreamcatalyst.scene.trainable import Splats  # noqa: E402

@@ -24,8 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "custom"))
 
 from dreamcatalyst.data.camera import Cameras  # noqa: E402
-from dreamcatalyst.render.api import rasterize  # noqa: E402
-from dreamcatalyst.render.frozen import Frozen  # noqa: E402
+from dreamcatalyst.render.api import Frozen, rasterize  # noqa: E402
 from dreamcatalyst.scene.gaussians import Gaussians  # noqa: E402
 
 SIZES = ((20_000, 128), (20_000, 256), (100_000, 256), (100_000, 512))

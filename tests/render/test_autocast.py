@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from dreamcatalyst.render.api import rasterize
-from dreamcatalyst.render.frozen import Frozen
+from dreamcatalyst.render.api import Frozen, rasterize
 
 
 def images_and_gradients(scene, cameras, backend, half: bool, **options):

@@ -33,7 +33,7 @@ import sys
 sys.path.insert(0, "custom")
 import logging
 logging.basicConfig()
-from dreamcatalyst.render.cpu_jit import kernel
+from dreamcatalyst.render.cpu.jit import kernel
 
 @kernel()
 def one(x):

@@ -7,9 +7,8 @@ import pytest
 import torch
 from dreamcatalyst.data.camera import Cameras
 from dreamcatalyst.errors import SceneError
-from dreamcatalyst.render import cpu_frozen
-from dreamcatalyst.render.api import BACKENDS, rasterize
-from dreamcatalyst.render.frozen import Frozen
+from dreamcatalyst.render.api import BACKENDS, Frozen, rasterize
+from dreamcatalyst.render.cpu import frozen as cpu_frozen
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 
 TOTAL = 160

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
+from ..cache import ByteCache
 from ..data.camera import Cameras
 from ..errors import SceneError
 from ..registry import Registry
 from ..scene.gaussians import Gaussians
-from .frozen import Frozen
 
 BACKENDS = Registry("rasterizer backend", __package__)
 BACKENDS.add("reference", ".reference:BACKEND")
-BACKENDS.add("cpu", ".cpu:BACKEND")
+BACKENDS.add("cpu", ".cpu.api:BACKEND")
 BACKENDS.add("gsplat", ".gsplat:BACKEND")
 
 
@@ -39,6 +40,22 @@ class Render:
     features: Float[Tensor, "V H W F"] | None
     means2d: Float[Tensor, "V N 2"]
     radii: Int32[Tensor, "V N"]
+
+
+class Frozen:
+    """F splats without gradient, drawn together with those that are edited (`rasterize(..., frozen=)`).
+
+    kept: what a backend keeps per view (a tile's list, an image), by everything that it depends on; anything that says
+    how many `nbytes` it takes, at most `limit` bytes in all. A limit of 0 keeps nothing.
+    scene shares memory with the splats given, which must not be changed in place. len() is F.
+    """
+
+    def __init__(self, scene: Gaussians, limit: int = 2**30):
+        self.scene = scene.detach()
+        self.kept = ByteCache(limit, size=attrgetter("nbytes"))
+
+    def __len__(self) -> int:
+        return len(self.scene)
 
 
 @dataclass(frozen=True)

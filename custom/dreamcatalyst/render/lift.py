@@ -62,22 +62,20 @@ def lift(
     return Evidence(*found.unbind(dim=1))
 
 
-def vote(
-    scene: Gaussians, cameras: Cameras, masks: Masks, *, antialiased: bool = False
-) -> Evidence:
+def vote(scene: Gaussians, cameras: Cameras, masks: Masks, *, antialiased: bool = False) -> Evidence:
     """GaussianEditor's count as its code has it, for comparison: every splat that contributes to a pixel counts there
     with M and with 1, however little of it is seen.
 
     Arguments and result as in `lift`. What contributes is decided by render/thresholds.py. It is no derivative of an
     image, so it runs on the CPU in float32, wherever the scene is.
     """
-    from . import cpu_vote
+    from .cpu.vote import count
 
     _check(cameras, masks)
     on_cpu, cameras = scene.detach().to("cpu", torch.float32), cameras.to("cpu", torch.float32)
     found = torch.zeros(len(scene), 2)
     for v in range(len(cameras)):
-        found += cpu_vote.count(on_cpu, cameras[v], masks[v].to("cpu", torch.float32), antialiased)
+        found += count(on_cpu, cameras[v], masks[v].to("cpu", torch.float32), antialiased)
     return Evidence(*found.to(scene.means).unbind(dim=1))
 
 

@@ -9,8 +9,7 @@ from torch import device
 
 from ..config import Colour, Count
 from ..data.camera import Cameras
-from ..render.api import Backend, Render, find_backend, rasterize
-from ..render.frozen import Frozen
+from ..render.api import Backend, Frozen, Render, find_backend, rasterize
 from ..report.clock import Clock
 from ..scene.gaussians import Gaussians
 from ..scene.trainable import Splats

@@ -16,8 +16,7 @@ from torch import Tensor
 from ..data.camera import Cameras
 from ..data.views import Capture
 from ..errors import ConfigError
-from ..render.api import Backend, Render
-from ..render.frozen import Frozen
+from ..render.api import Backend, Frozen, Render
 from ..report.clock import Clock
 from ..report.run import Panels, ReportConfig
 from ..scene.fitted import Fitted

@@ -1,5 +1,4 @@
-"""The compiled CPU rasterizer: three differentiable nodes (project, shade, composite) around the numba kernels of
-`cpu_*.py`.
+"""Three differentiable nodes (project, shade, composite) around the numba kernels of this folder.
 
 float32 only. Every sum has a fixed order, so that the same bits come out whatever the number of threads.
 """
@@ -14,11 +13,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..data.camera import Cameras
-from ..scene.gaussians import Gaussians
-from . import cpu_composite, cpu_frozen, cpu_project, cpu_sh, cpu_tiles
-from .api import Backend, Render
-from .frozen import Frozen
+from ...data.camera import Cameras
+from ...scene.gaussians import Gaussians
+from ..api import Backend, Frozen, Render
+from . import composite, project, sh, tiles
+from .frozen import View, draw, view
 
 
 def rasterize(
@@ -38,10 +37,10 @@ def rasterize(
     extras += [depths[..., None]] if depth else []
     extras = torch.cat(extras, dim=-1) if extras else None
 
-    def view(v: int, touched: np.ndarray) -> cpu_frozen.View:
+    def behind_view(v: int, touched: np.ndarray) -> View:
         return _frozen_view(frozen, cameras[v], touched, sh_degree, antialiased)
 
-    behind = None if frozen is None else view
+    behind = None if frozen is None else behind_view
     size = cameras.width, cameras.height
     rgb, alpha, image = Composite.apply(
         means2d, conics, colors, opacities, extras, background, depths.detach(), radii, *size, behind
@@ -64,9 +63,7 @@ def _splats(scene: Gaussians, cameras: Cameras, sh_degree: int, antialiased: boo
     return means2d, conics, colors, opacities, depths, radii
 
 
-def _frozen_view(
-    frozen: Frozen, camera: Cameras, touched: np.ndarray, sh_degree: int, antialiased: bool
-) -> cpu_frozen.View:
+def _frozen_view(frozen: Frozen, camera: Cameras, touched: np.ndarray, sh_degree: int, antialiased: bool) -> View:
     """What is kept of the frozen splats in one view, made anew where there is nothing or `touched`, the numbers of the
     tiles that edited splats touch, goes beyond it."""
     size = camera.width, camera.height
@@ -76,7 +73,7 @@ def _frozen_view(
     if kept is None or not kept.covered[touched].all():
         *splats, radii = _splats(frozen.scene, camera, sh_degree, antialiased)
         arrays = [array[0] for array in _arrays(*splats)]
-        kept = cpu_frozen.view(*arrays, radii[0].numpy(), *size, touched, kept)
+        kept = view(*arrays, radii[0].numpy(), *size, touched, kept)
         frozen.kept.put(key, kept)
     return kept
 
@@ -97,7 +94,7 @@ class Project(torch.autograd.Function):
         radii = torch.empty(shape, dtype=torch.int32)
         inputs = means, quats, log_scales, logits, cameras.viewmats, cameras.Ks
         ctx.options = cameras.width, cameras.height, antialiased
-        cpu_project.forward(*_arrays(*inputs), *ctx.options, *_arrays(*outputs), radii.numpy())
+        project.forward(*_arrays(*inputs), *ctx.options, *_arrays(*outputs), radii.numpy())
         ctx.save_for_backward(*inputs, outputs[1])
         ctx.mark_non_differentiable(radii)
         return *outputs, radii
@@ -107,7 +104,7 @@ class Project(torch.autograd.Function):
     def backward(ctx, *grads: Tensor):
         *inputs, conics = ctx.saved_tensors
         out = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:4]]
-        cpu_project.backward(*_arrays(*inputs), *ctx.options, *_arrays(conics, *grads[:4]), *_arrays(*out))
+        project.backward(*_arrays(*inputs), *ctx.options, *_arrays(conics, *grads[:4]), *_arrays(*out))
         return *out, None, None
 
 
@@ -117,7 +114,7 @@ class Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means: Tensor, sh0: Tensor, shN: Tensor, centers: Tensor, degree: int):
         colors = means.new_empty(len(centers), len(means), 3)
-        cpu_sh.forward(*_arrays(means, centers, sh0, shN), degree, *_arrays(colors))
+        sh.forward(*_arrays(means, centers, sh0, shN), degree, *_arrays(colors))
         ctx.save_for_backward(means, centers, sh0, shN, colors)
         ctx.degree = degree
         return colors
@@ -127,7 +124,7 @@ class Shade(torch.autograd.Function):
     def backward(ctx, grad: Tensor):
         means, centers, sh0, shN, colors = ctx.saved_tensors
         out = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (means, sh0, shN)]
-        cpu_sh.backward(*_arrays(means, centers, shN), ctx.degree, *_arrays(colors, grad), *_arrays(*out))
+        sh.backward(*_arrays(means, centers, shN), ctx.degree, *_arrays(colors, grad), *_arrays(*out))
         return *out, None, None
 
 
@@ -139,7 +136,7 @@ class Composite(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx, means2d, conics, colors, opacities, extras, background, depths, radii, width: int, height: int,
-        behind: Callable[[int, np.ndarray], cpu_frozen.View] | None,
+        behind: Callable[[int, np.ndarray], View] | None,
     ):  # fmt: skip
         views, n = depths.shape
         channels = 0 if extras is None else extras.shape[-1]
@@ -149,20 +146,20 @@ class Composite(torch.autograd.Function):
         (shade_behind,) = _arrays(background)
         for v in range(views):
             xy, conic, color, opacity, z = _arrays(means2d[v], conics[v], colors[v], opacities[v], depths[v])
-            order = cpu_tiles.depth_order(z, radii[v].numpy())
+            order = tiles.depth_order(z, radii[v].numpy())
             splats = xy, conic, opacity, color
             if behind is None:
                 extra = np.empty((len(order), 0), np.float32) if extras is None else _arrays(extras[v])[0][order]
-                packed, starts, entries, first_slots = cpu_tiles.tile_lists(order, *splats, width, height)
-                spans = cpu_composite.spans(np.arange(len(starts) - 1), starts[1:], width, height)
+                packed, starts, entries, first_slots = tiles.tile_lists(order, *splats, width, height)
+                spans = composite.spans(np.arange(len(starts) - 1), starts[1:], width, height)
                 drawn = packed, extra, spans, entries, width, height, shade_behind
-                final = np.empty((len(spans), cpu_composite.PIXELS), np.float32)
-                state = final, np.empty_like(final), np.empty((0, 4, cpu_composite.PIXELS), np.float32)
-                cpu_composite.forward(*drawn, rgb[v], alpha[v], image[v], *state)
+                final = np.empty((len(spans), composite.PIXELS), np.float32)
+                state = final, np.empty_like(final), np.empty((0, 4, composite.PIXELS), np.float32)
+                composite.forward(*drawn, rgb[v], alpha[v], image[v], *state)
                 rounds = [(order, first_slots, (*drawn, *state))]
             else:
                 find = partial(behind, v)
-                rounds = cpu_frozen.draw(find, order, z, radii[v].numpy(), splats, shade_behind, rgb[v], alpha[v])
+                rounds = draw(find, order, z, radii[v].numpy(), splats, shade_behind, rgb[v], alpha[v])
             ctx.lists += [(v, *lists) for lists in rounds]
         ctx.shapes = n, channels
         alpha = torch.from_numpy(alpha)
@@ -181,13 +178,13 @@ class Composite(torch.autograd.Function):
         for v, order, first_slots, drawn in ctx.lists:
             slots = np.empty((int(first_slots[-1]), 9 + channels), np.float32)
             used = np.zeros(len(slots), np.uint8)
-            cpu_composite.backward(*drawn, *cotangents[v], slots, used)
+            composite.backward(*drawn, *cotangents[v], slots, used)
             targets = g_means2d[v], g_conics[v], g_opacities[v], g_colors[v], g_extras[v]
-            cpu_composite.gather(order, first_slots, slots, used, *targets)
+            composite.gather(order, first_slots, slots, used, *targets)
         if g_background is not None:
             rows = np.empty((views, alpha.shape[1], 3), np.float32)
             for v in range(views):
-                cpu_composite.background_rows(alpha[v].numpy(), cotangents[v][0], rows[v])
+                composite.background_rows(alpha[v].numpy(), cotangents[v][0], rows[v])
             g_background += rows.sum(axis=(0, 1))
         out = [torch.from_numpy(g) for g in grads]
         g_background = None if g_background is None else torch.from_numpy(g_background)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .cpu_jit import kernel
-from .thresholds import ALPHA_MIN
+from ..thresholds import ALPHA_MIN
+from .jit import kernel
 
 f32 = np.float32
 TILE_W, TILE_H = 8, 16  # pixels; a row is one vector of eight floats

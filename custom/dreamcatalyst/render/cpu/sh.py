@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .cpu_jit import kernel
-from .sh import C1, C2, C3, SH_C0
+from ..sh import C1, C2, C3, SH_C0
+from .jit import kernel
 
 f32 = np.float32
 ZERO, HALF, TINY = f32(0), f32(0.5), f32(1e-12)

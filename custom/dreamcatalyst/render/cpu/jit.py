@@ -1,4 +1,4 @@
-"""How the kernels of `cpu_*.py` are compiled and where the compiled code is kept."""
+"""How the kernels of this folder are compiled and where the compiled code is kept."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-from .. import plugin
+from ... import plugin
 
 _FOLDER = Path(__file__).parent
-_SOURCES = [*sorted(_FOLDER.glob("cpu_*.py")), _FOLDER / "thresholds.py", _FOLDER / "sh.py"]
+_SOURCES = [*sorted(_FOLDER.glob("*.py")), _FOLDER.parent / "thresholds.py", _FOLDER.parent / "sh.py"]
 _DIGEST = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES)).hexdigest()[:16]
 _CACHE = Path(numba.config.CACHE_DIR or _FOLDER / "__pycache__") / f"kernels-{_DIGEST}"
 

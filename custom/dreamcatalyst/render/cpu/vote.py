@@ -7,14 +7,14 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from ..data.camera import Cameras
-from ..scene.gaussians import Gaussians
-from . import cpu_composite, cpu_project, cpu_tiles
-from .cpu_composite import LAST, ONE, PIXELS, ROWS, STRIDES, ZERO, T, W, f32, u64
-from .cpu_jit import kernel
-from .cpu_tiles import TILE_H, TILE_W
+from ...data.camera import Cameras
+from ...scene.gaussians import Gaussians
+from . import composite, project, tiles
+from .composite import LAST, ONE, PIXELS, ROWS, STRIDES, ZERO, T, W, f32, u64
+from .jit import kernel
+from .tiles import TILE_H, TILE_W
 
-_draw, _place, _rows = cpu_composite._draw, cpu_composite._place, cpu_composite._rows
+_draw, _place, _rows = composite._draw, composite._place, composite._rows
 
 
 @kernel(parallel=True, fastmath=True)
@@ -53,10 +53,10 @@ def count(scene: Gaussians, camera: Cameras, mask: Tensor, antialiased: bool) ->
     radii = np.empty((1, n), np.int32)
     inputs = scene.means, scene.quats, scene.log_scales, scene.logit_opacities, camera.viewmats, camera.Ks
     arrays = [tensor.contiguous().numpy() for tensor in inputs]
-    cpu_project.forward(*arrays, *size, antialiased, means2d, conics, depths, opacities, radii)
-    order = cpu_tiles.depth_order(depths[0], radii[0])
+    project.forward(*arrays, *size, antialiased, means2d, conics, depths, opacities, radii)
+    order = tiles.depth_order(depths[0], radii[0])
     colors = np.zeros((n, 3), np.float32)
-    packed, starts, entries, first = cpu_tiles.tile_lists(order, means2d[0], conics[0], opacities[0], colors, *size)
+    packed, starts, entries, first = tiles.tile_lists(order, means2d[0], conics[0], opacities[0], colors, *size)
     slots = np.zeros((len(entries), 2), np.float32)
     _count(packed, starts, entries, *size, mask.contiguous().numpy(), slots)
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(slots, axis=0, dtype=np.float64)])[first]

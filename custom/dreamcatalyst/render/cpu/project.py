@@ -12,8 +12,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .cpu_jit import kernel
-from .thresholds import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
+from ..thresholds import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
+from .jit import kernel
 
 f32, i32 = np.float32, np.int32
 ALPHA_MIN, BLUR, MARGIN, NEAR = f32(ALPHA_MIN), f32(BLUR), f32(FRUSTUM_MARGIN), f32(NEAR)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numba import prange
 
-from .cpu_composite import AFTER, BEGIN, BOTTOM, END, FIRST, PIXELS, TILE, TOP, forward, spans
-from .cpu_jit import kernel
-from .cpu_tiles import PY, RY, TILE_H, TILE_W, depth_order, first_pixel, last_pixel, tile_lists
+from .composite import AFTER, BEGIN, BOTTOM, END, FIRST, PIXELS, TILE, TOP, forward, spans
+from .jit import kernel
+from .tiles import PY, RY, TILE_H, TILE_W, depth_order, first_pixel, last_pixel, tile_lists
 
 f32 = np.float32
 NEAREST, MANY = 3, 4096  # of so many edited splats, this part of them is drawn before the rest is listed
@@ -158,7 +158,7 @@ def draw(
     """Fill rgb [H,W,3] and alpha [H,W,1] with the frozen splats and the edited ones `order` [M] of depths [N].
 
     find: gives the view with the tiles (numbers) covered that it is given. radii [N]; splats: means2d, conics,
-    opacities and colors as for `tile_lists`. Returns (order, first_slots, arguments of `cpu_composite.backward`) of
+    opacities and colors as for `tile_lists`. Returns (order, first_slots, arguments of `composite.backward`) of
     each round: the nearest splats come first, and where these finish a tile, those behind are not even listed. The
     other tiles are drawn anew with all.
     """

@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from .cpu_jit import kernel
-from .cpu_tiles import (
+from ..thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .jit import kernel
+from .tiles import (
     BLUE,
     GREEN,
     OPACITY,
@@ -27,7 +28,6 @@ from .cpu_tiles import (
     first_pixel,
     last_pixel,
 )
-from .thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 f32, u64 = np.float32, np.uint64
 PIXELS = TILE_W * TILE_H
