@@ -4,6 +4,7 @@ device that is not the CPU's; and that a mistake in the product itself would be 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
@@ -109,7 +110,8 @@ def a_network_left_on_the_cpu(monkeypatch):
 
 def a_background_on_the_cpu(monkeypatch):
     arguments = gsplat.arguments
-    monkeypatch.setattr(gsplat, "arguments", lambda *a, background, **k: arguments(*a, background=torch.zeros(3), **k))
+    black = torch.zeros(3)
+    monkeypatch.setattr(gsplat, "arguments", lambda s, c, options: arguments(s, c, replace(options, background=black)))
 
 
 def a_source_on_the_cpu(monkeypatch):

@@ -6,8 +6,8 @@ from dreamcatalyst.render.api import BACKENDS, Backend
 from dreamcatalyst.render.reference import rasterize
 
 
-def draw(scene, cameras, **options):
-    render = rasterize(scene, cameras, **options)
+def draw(scene, cameras, options):
+    render = rasterize(scene, cameras, options)
     return replace(render, rgb=render.rgb.flip(-1))
 
 

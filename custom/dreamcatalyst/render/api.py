@@ -42,6 +42,21 @@ class Render:
     radii: Int32[Tensor, "V N"]
 
 
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a backend draws N splats: what `rasterize` was given or chose, of the splats' type and on their device.
+
+    background [3]; sh_degree: bases above it are left out; features [N,F] to composite over zero, None for none; depth:
+    whether it is asked for; antialiased: whether opacity is scaled by what the blur adds to a splat's area.
+    """
+
+    background: Float[Tensor, " 3"]
+    sh_degree: int
+    features: Float[Tensor, "N F"] | None
+    depth: bool
+    antialiased: bool
+
+
 class Frozen:
     """F splats without gradient, drawn together with those that are edited (`rasterize(..., frozen=)`).
 
@@ -62,10 +77,11 @@ class Frozen:
 class Backend:
     """One way to draw, and what it can: all who choose a backend ask here.
 
-    draw: as `rasterize`, for splats that `check` lets through. devices, dtypes: what it takes (types of torch.device),
-    empty for any. keeps_frozen: draw takes `frozen` itself, for colour alone, and keeps of it what does not change;
-    others are given all splats in one scene. prepare: makes sure that it can draw at all on this machine, before a run
-    loads anything, and does what takes long; raises SceneError with the remedy where it cannot.
+    draw(scene, cameras, options): a Render of splats that `check` lets through, by RenderOptions. devices, dtypes: what
+    it takes (types of torch.device), empty for any. keeps_frozen: draw takes `frozen` itself as a fourth, for colour
+    alone, and keeps of it what does not change; others are given all splats in one scene. prepare: makes sure that it
+    can draw at all on this machine, before a run loads anything, and does what takes long; raises SceneError with the
+    remedy where it cannot.
     """
 
     name: str
@@ -75,14 +91,19 @@ class Backend:
     keeps_frozen: bool = False
     prepare: Callable[[], None] | None = None
 
+    def takes(self, device: torch.device, dtype: torch.dtype) -> bool:
+        """Whether it can draw splats of this kind."""
+        return device.type in (self.devices or [device.type]) and dtype in (self.dtypes or [dtype])
+
     def check(self, device: torch.device, dtype: torch.dtype) -> None:
         """Raise SceneError where it cannot draw splats of this kind."""
-        if device.type in (self.devices or [device.type]) and dtype in (self.dtypes or [dtype]):
+        if self.takes(device, dtype):
             return
+        others = ", ".join(backend.name for backend in BACKENDS.parts() if backend.takes(device, dtype))
         where, kind = (self.devices or [device.type])[0], (self.dtypes or [dtype])[0]
         raise SceneError(
             f"rasterize: backend '{self.name}' got {dtype} splats on {device}, expected {kind} on {where}. Convert "
-            f"them with .to('{where}', {kind}), or choose another backend: 'reference' takes any, 'auto' chooses."
+            f"them with .to('{where}', {kind}), or choose a backend that takes them: {others}; 'auto' chooses."
         )
 
 
@@ -137,7 +158,7 @@ def rasterize(
     drawer = find_backend(backend, scene.means.device, scene.means.dtype)
     with torch.autocast(scene.means.device.type, enabled=False):
         cameras = cameras.to(scene.means.device, scene.means.dtype)
-        options = dict(
+        options = RenderOptions(
             background=background.to(scene.means),
             sh_degree=scene.sh_degree if sh_degree is None else sh_degree,
             features=None if features is None else features.to(scene.means),
@@ -145,11 +166,11 @@ def rasterize(
             antialiased=antialiased,
         )
         if frozen is None:
-            return drawer.draw(scene, cameras, **options)
+            return drawer.draw(scene, cameras, options)
         if drawer.keeps_frozen and features is None and not depth:
-            return drawer.draw(scene, cameras, **options, frozen=frozen)
+            return drawer.draw(scene, cameras, options, frozen)
         whole = Gaussians.cat([replace(part, extra={}) for part in (frozen.scene, scene)])
-        render = drawer.draw(whole, cameras, **options)
+        render = drawer.draw(whole, cameras, options)
         return replace(render, means2d=_tail(render.means2d, len(frozen)), radii=render.radii[:, len(frozen) :])
 
 

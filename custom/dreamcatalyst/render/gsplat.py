@@ -19,7 +19,7 @@ from ..data.camera import Cameras
 from ..errors import SceneError
 from ..scene.gaussians import Gaussians
 from . import reference, sh
-from .api import Backend, Render
+from .api import Backend, Render, RenderOptions
 from .thresholds import BLUR, NEAR
 
 # Which versions draw this image model (thresholds.py): earlier ones cut splats at 3 standard deviations (1.4) or lack a
@@ -29,36 +29,28 @@ INSTALL = "pip install 'gsplat>=1.5.3,<1.6'"
 SMALLEST_NORM = 1e-12  # of quaternions; a smaller one is the identity, as in projection.rotations
 
 
-def rasterize(scene: Gaussians, cameras: Cameras, **options: Any) -> Render:
+def rasterize(scene: Gaussians, cameras: Cameras, options: RenderOptions) -> Render:
     """Draw `scene`; arguments and result as in `api.rasterize`. Raises SceneError where gsplat is not installed."""
     if len(scene) == 0:  # gsplat divides by the number of splats
-        return reference.rasterize(scene, cameras, **options)
-    image, alpha, meta = package().rasterization(**arguments(scene, cameras, **options))
-    features, radii = options["features"], meta["radii"]
+        return reference.rasterize(scene, cameras, options)
+    image, alpha, meta = package().rasterization(**arguments(scene, cameras, options))
+    features, radii = options.features, meta["radii"]
     return Render(
         rgb=image[..., :3],
         alpha=alpha,
-        depth=image[..., -1:] if options["depth"] else None,
+        depth=image[..., -1:] if options.depth else None,
         features=None if features is None else image[..., 3 : 3 + features.shape[1]],
         means2d=meta["means2d"],
         radii=radii.amax(dim=-1).int(),  # gsplat gives one radius per axis
     )
 
 
-def arguments(
-    scene: Gaussians,
-    cameras: Cameras,
-    *,
-    background: Tensor,
-    sh_degree: int,
-    features: Tensor | None,
-    depth: bool,
-    antialiased: bool,
-) -> dict[str, Any]:
+def arguments(scene: Gaussians, cameras: Cameras, options: RenderOptions) -> dict[str, Any]:
     """The arguments of `gsplat.rasterization` that draw the same images. Colours are evaluated here, so that features
     ride along as further channels [V,N,3+F] over a zero background; depth comes last, divided by alpha (mode ED)."""
     views = len(cameras)
-    channels = sh.colors(scene.means, cameras.centers, scene.sh0, scene.shN, sh_degree)
+    channels = sh.colors(scene.means, cameras.centers, scene.sh0, scene.shN, options.sh_degree)
+    background, features = options.background, options.features
     if features is not None:
         channels = torch.cat([channels, features.expand(views, -1, -1)], dim=-1)
         background = torch.cat([background, background.new_zeros(features.shape[1])])
@@ -76,8 +68,8 @@ def arguments(
         eps2d=BLUR,
         packed=False,
         backgrounds=background.expand(views, -1),
-        render_mode="RGB+ED" if depth else "RGB",
-        rasterize_mode="antialiased" if antialiased else "classic",
+        render_mode="RGB+ED" if options.depth else "RGB",
+        rasterize_mode="antialiased" if options.antialiased else "classic",
     )
 
 

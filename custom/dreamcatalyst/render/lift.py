@@ -53,9 +53,10 @@ def lift(
     scene, found = scene.detach(), scene.means.new_zeros(len(scene), 2)
     for v in range(len(cameras)):
         features = torch.zeros_like(found, requires_grad=True)
-        options = dict(sh_degree=0, backend=backend, antialiased=antialiased)
         with torch.enable_grad():
-            image = rasterize(scene, cameras[v], features=features, **options).features
+            image = rasterize(
+                scene, cameras[v], features=features, sh_degree=0, backend=backend, antialiased=antialiased
+            ).features
         mask = masks[v].to(image)
         (gradient,) = torch.autograd.grad(image, features, torch.stack([mask, torch.ones_like(mask)], dim=-1)[None])
         found += gradient

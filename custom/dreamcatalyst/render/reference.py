@@ -13,30 +13,21 @@ from torch import Tensor
 from ..data.camera import Cameras
 from ..scene.gaussians import Gaussians
 from . import sh
-from .api import Backend, Render
+from .api import Backend, Render, RenderOptions
 from .projection import project, radii
 from .thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 
-def rasterize(
-    scene: Gaussians,
-    cameras: Cameras,
-    *,
-    background: Tensor,
-    sh_degree: int,
-    features: Tensor | None,
-    depth: bool,
-    antialiased: bool,
-) -> Render:
+def rasterize(scene: Gaussians, cameras: Cameras, options: RenderOptions) -> Render:
     """Draw `scene`; arguments and result as in `api.rasterize`. Source: Kerbl et al. 2023, sections 4-6."""
     splats = project(scene.means, scene.quats, scene.scales, cameras)
-    rgb = sh.colors(scene.means, cameras.centers, scene.sh0, scene.shN, sh_degree)
+    rgb = sh.colors(scene.means, cameras.centers, scene.sh0, scene.shN, options.sh_degree)
     opacities = scene.opacities.expand(len(cameras), -1)
-    if antialiased:
+    if options.antialiased:
         opacities = opacities * splats.compensation
     views, n = opacities.shape
     channels = [rgb, splats.depths[..., None]]
-    channels += [] if features is None else [features.expand(views, -1, -1)]
+    channels += [] if options.features is None else [options.features.expand(views, -1, -1)]
     channels = torch.cat(channels, dim=-1)
     radius = radii(splats, opacities, cameras)
 
@@ -53,10 +44,10 @@ def rasterize(
     image, alpha = torch.stack(images).view(size), torch.stack(alphas).view(size)
     covered = torch.where(alpha > 0, alpha, 1.0)
     return Render(
-        rgb=image[..., :3] + (1 - alpha) * background,
+        rgb=image[..., :3] + (1 - alpha) * options.background,
         alpha=alpha,
-        depth=image[..., 3:4] / covered if depth else None,
-        features=None if features is None else image[..., 4:],
+        depth=image[..., 3:4] / covered if options.depth else None,
+        features=None if options.features is None else image[..., 4:],
         means2d=splats.means2d,
         radii=radius,
     )

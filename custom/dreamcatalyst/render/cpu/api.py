@@ -15,63 +15,54 @@ from torch.autograd.function import once_differentiable
 
 from ...data.camera import Cameras
 from ...scene.gaussians import Gaussians
-from ..api import Backend, Frozen, Render
+from ..api import Backend, Frozen, Render, RenderOptions
 from . import composite, project, sh, tiles
 from .frozen import View, draw, view
 
 
-def rasterize(
-    scene: Gaussians,
-    cameras: Cameras,
-    *,
-    background: Tensor,
-    sh_degree: int,
-    features: Tensor | None,
-    depth: bool,
-    antialiased: bool,
-    frozen: Frozen | None = None,
-) -> Render:
+def rasterize(scene: Gaussians, cameras: Cameras, options: RenderOptions, frozen: Frozen | None = None) -> Render:
     """Draw `scene`; arguments and result as in `api.rasterize`, but `frozen` excludes features and depth."""
-    means2d, conics, colors, opacities, depths, radii = _splats(scene, cameras, sh_degree, antialiased)
+    means2d, conics, colors, opacities, depths, radii = _splats(scene, cameras, options)
+    features = options.features
     extras = [] if features is None else [features.expand(len(cameras), -1, -1)]
-    extras += [depths[..., None]] if depth else []
+    extras += [depths[..., None]] if options.depth else []
     extras = torch.cat(extras, dim=-1) if extras else None
 
     def behind_view(v: int, touched: np.ndarray) -> View:
-        return _frozen_view(frozen, cameras[v], touched, sh_degree, antialiased)
+        return _frozen_view(frozen, cameras[v], touched, options)
 
     behind = None if frozen is None else behind_view
     size = cameras.width, cameras.height
     rgb, alpha, image = Composite.apply(
-        means2d, conics, colors, opacities, extras, background, depths.detach(), radii, *size, behind
+        means2d, conics, colors, opacities, extras, options.background, depths.detach(), radii, *size, behind
     )
     return Render(
         rgb=rgb,
         alpha=alpha,
-        depth=image[..., -1:] / torch.where(alpha > 0, alpha, 1.0) if depth else None,
+        depth=image[..., -1:] / torch.where(alpha > 0, alpha, 1.0) if options.depth else None,
         features=None if features is None else image[..., : features.shape[1]],
         means2d=means2d,
         radii=radii,
     )
 
 
-def _splats(scene: Gaussians, cameras: Cameras, sh_degree: int, antialiased: bool) -> tuple[Tensor, ...]:
+def _splats(scene: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, ...]:
     """means2d [V,N,2], conics [V,N,3], colors [V,N,3], opacities [V,N], depths [V,N], radii [V,N]."""
     parameters = scene.means, scene.quats, scene.log_scales, scene.logit_opacities
-    means2d, conics, depths, opacities, radii = Project.apply(*parameters, cameras, antialiased)
-    colors = Shade.apply(scene.means, scene.sh0, scene.shN, cameras.centers, sh_degree)
+    means2d, conics, depths, opacities, radii = Project.apply(*parameters, cameras, options.antialiased)
+    colors = Shade.apply(scene.means, scene.sh0, scene.shN, cameras.centers, options.sh_degree)
     return means2d, conics, colors, opacities, depths, radii
 
 
-def _frozen_view(frozen: Frozen, camera: Cameras, touched: np.ndarray, sh_degree: int, antialiased: bool) -> View:
+def _frozen_view(frozen: Frozen, camera: Cameras, touched: np.ndarray, options: RenderOptions) -> View:
     """What is kept of the frozen splats in one view, made anew where there is nothing or `touched`, the numbers of the
     tiles that edited splats touch, goes beyond it."""
     size = camera.width, camera.height
     numbers = (tensor.numpy().tobytes() for tensor in (camera.viewmats, camera.Ks))
-    key = "cpu", *numbers, *size, sh_degree, antialiased
+    key = "cpu", *numbers, *size, options.sh_degree, options.antialiased
     kept = frozen.kept.find(key)
     if kept is None or not kept.covered[touched].all():
-        *splats, radii = _splats(frozen.scene, camera, sh_degree, antialiased)
+        *splats, radii = _splats(frozen.scene, camera, options)
         arrays = [array[0] for array in _arrays(*splats)]
         kept = view(*arrays, radii[0].numpy(), *size, touched, kept)
         frozen.kept.put(key, kept)
