@@ -12,22 +12,7 @@ from numba import njit, prange
 
 from ..thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .jit import kernel
-from .tiles import (
-    BLUE,
-    GREEN,
-    OPACITY,
-    PX,
-    PY,
-    RED,
-    RY,
-    TILE_H,
-    TILE_W,
-    A,
-    D,
-    M,
-    first_pixel,
-    last_pixel,
-)
+from .tiles import BLUE, GREEN, OPACITY, PX, PY, RED, RY, TILE_H, TILE_W, A, D, M, first_pixel, last_pixel
 
 f32, u64 = np.float32, np.uint64
 PIXELS = TILE_W * TILE_H
@@ -223,11 +208,13 @@ def forward(packed, extras, spans, entries, width, height, background, rgb, alph
             for y in range(TILE_H):
                 for x in range(TILE_W):  # pixels that are not drawn count as finished
                     s[T + u64(y * TILE_W + x)] = ONE if x0 + x < width and top <= y0 + y < bottom else -ONE
+            # up to AFTER: what the backward pass has to undo starts from the state behind these entries
             begin, after, end = spans[i, BEGIN], spans[i, AFTER], spans[i, END]
             spans[i, END] = _walk(s, more, packed, extras, entries, begin, begin, after, y0, top, bottom)
             for p in range(PIXELS):
                 q = u64(p)
                 final[i, p], last[i, p] = abs(s[T + q]), s[LAST + q]
+            # from AFTER on: nothing takes derivatives, so that only their sum is kept, with the background's
             if spans[i, END] == after and after < end:
                 for p in range(PIXELS):
                     q = u64(p)
@@ -240,6 +227,7 @@ def forward(packed, extras, spans, entries, width, height, background, rgb, alph
                     rest[i, 1, p] = s[C1 + q] - rest[i, 1, p] + t * background[1]
                     rest[i, 2, p] = s[C2 + q] - rest[i, 2, p] + t * background[2]
                     rest[i, 3, p] = t
+            # the tile is finished: out of the scratch array into the images
             for p in range(PIXELS):
                 q = u64(p)
                 y, x = y0 + p // TILE_W, x0 + p % TILE_W
@@ -255,24 +243,12 @@ def forward(packed, extras, spans, entries, width, height, background, rgb, alph
 
 @kernel(parallel=True, fastmath=True)
 def backward(
-    packed,
-    extras,
-    spans,
-    entries,
-    width,
-    height,
-    background,
-    final,
-    last,
-    rest,
-    v_rgb,
-    v_alpha,
-    v_image,
-    slots,
-    used,
-):
+    packed, extras, spans, entries, width, height, background, final, last, rest,
+    v_rgb, v_alpha, v_image, slots, used,
+):  # fmt: skip
     """Fill slots [I,9+E] with the derivatives of each pair of splat and tile, and used [I] with 1 where there are any.
-    v_*: the derivatives in the images of `forward`."""
+    v_rgb [H,W,3], v_alpha [H,W,1], v_image [H,W,E]: the derivatives in the images of `forward`; all before them as
+    there."""
     tiles_x, channels = -(-width // TILE_W), extras.shape[1]
     for task in prange(STRIDES):
         s, more = np.zeros(ROWS * PIXELS, np.float32), np.zeros((channels, PIXELS), np.float32)
@@ -281,6 +257,7 @@ def backward(
             top, bottom = spans[i, TOP], spans[i, BOTTOM]
             s[T:] = ZERO
             more[:] = ZERO
+            # the state in which the forward pass left the pixels, and the images' derivatives there
             deepest, rested = ZERO, spans[i, AFTER] < spans[i, END]
             for p in range(PIXELS):
                 q = u64(p)
@@ -298,6 +275,7 @@ def backward(
                     deepest = max(deepest, last[i, p])
                     for c in range(channels):
                         more[c, p] = v_image[y, x, c]
+            # back to front, from the deepest splat that any pixel saw
             begin = spans[i, BEGIN]
             for k in range(begin + int(deepest) - 1, spans[i, FIRST] - 1, -1):
                 j, slot = entries[k, 0], entries[k, 1]
@@ -305,6 +283,7 @@ def backward(
                 if slot < 0:
                     _pass(s, start, stop, packed, j, f32(k - begin + 1))
                     continue
+                # extra channels count as further colours: their share of dL/dw before, their own derivative after
                 if channels > 0:
                     for p in range(start, stop):
                         s[VE + p] = ZERO
