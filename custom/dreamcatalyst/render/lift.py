@@ -57,6 +57,8 @@ def lift(
             image = rasterize(
                 scene, cameras[v], features=features, sh_degree=0, backend=backend, antialiased=antialiased
             ).features
+        if image is None:
+            raise SceneError(f"lift: backend '{backend}' draws no features")
         mask = masks[v].to(image)
         (gradient,) = torch.autograd.grad(image, features, torch.stack([mask, torch.ones_like(mask)], dim=-1)[None])
         found += gradient

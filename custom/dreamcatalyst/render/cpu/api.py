@@ -5,7 +5,7 @@ float32 only. Every sum has a fixed order, so that the same bits come out whatev
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from ...data.camera import Cameras
 from ...scene.gaussians import Gaussians
 from ..api import Backend, Frozen, Render, RenderOptions
-from . import composite, project, sh, tiles
+from . import composite, project, records, sh, tiles
 from .frozen import View, draw, view
 
 
@@ -28,10 +28,7 @@ def rasterize(scene: Gaussians, cameras: Cameras, options: RenderOptions, frozen
     extras += [depths[..., None]] if options.depth else []
     extras = torch.cat(extras, dim=-1) if extras else None
 
-    def behind_view(v: int, touched: np.ndarray) -> View:
-        return _frozen_view(frozen, cameras[v], touched, options)
-
-    behind = None if frozen is None else behind_view
+    behind = None if frozen is None else partial(_frozen_view, frozen, cameras, options)
     size = cameras.width, cameras.height
     rgb, alpha, image = Composite.apply(
         means2d, conics, colors, opacities, extras, options.background, depths.detach(), radii, *size, behind
@@ -54,17 +51,18 @@ def _splats(scene: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple
     return means2d, conics, colors, opacities, depths, radii
 
 
-def _frozen_view(frozen: Frozen, camera: Cameras, touched: np.ndarray, options: RenderOptions) -> View:
-    """What is kept of the frozen splats in one view, made anew where there is nothing or `touched`, the numbers of the
+def _frozen_view(frozen: Frozen, cameras: Cameras, options: RenderOptions, v: int, touched: np.ndarray) -> View:
+    """What is kept of the frozen splats in view v, made anew where there is nothing or `touched`, the numbers of the
     tiles that edited splats touch, goes beyond it."""
+    camera = cameras[v]
     size = camera.width, camera.height
     numbers = (tensor.numpy().tobytes() for tensor in (camera.viewmats, camera.Ks))
     key = "cpu", *numbers, *size, options.sh_degree, options.antialiased
     kept = frozen.kept.find(key)
     if kept is None or not kept.covered[touched].all():
         *splats, radii = _splats(frozen.scene, camera, options)
-        arrays = [array[0] for array in _arrays(*splats)]
-        kept = view(*arrays, radii[0].numpy(), *size, touched, kept)
+        means2d, conics, colors, opacities, depths = (array[0] for array in _arrays(*splats))
+        kept = view(means2d, conics, colors, opacities, depths, radii[0].numpy(), *size, touched, kept)
         frozen.kept.put(key, kept)
     return kept
 
@@ -72,6 +70,12 @@ def _frozen_view(frozen: Frozen, camera: Cameras, touched: np.ndarray, options: 
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     """C-contiguous float32 views (copies where they must be) for the kernels."""
     return [t.detach().float().contiguous().numpy() for t in tensors]
+
+
+def _given(inputs: Sequence[Tensor], options: tuple[int, int, bool]) -> tuple[project.Splats, project.Views]:
+    """Four raw parameters, viewmats and Ks, with (width, height, antialiased), for the kernels of project.py."""
+    *splats, viewmats, Ks = _arrays(*inputs)
+    return project.Splats(*splats), project.Views(viewmats, Ks, *options)
 
 
 class Project(torch.autograd.Function):
@@ -85,7 +89,8 @@ class Project(torch.autograd.Function):
         radii = torch.empty(shape, dtype=torch.int32)
         inputs = means, quats, log_scales, logits, cameras.viewmats, cameras.Ks
         ctx.options = cameras.width, cameras.height, antialiased
-        project.forward(*_arrays(*inputs), *ctx.options, *_arrays(*outputs), radii.numpy())
+        out = project.Projected(*_arrays(*outputs))
+        project.forward(*_given(inputs, ctx.options), out, radii.numpy())
         ctx.save_for_backward(*inputs, outputs[1])
         ctx.mark_non_differentiable(radii)
         return *outputs, radii
@@ -95,7 +100,8 @@ class Project(torch.autograd.Function):
     def backward(ctx, *grads: Tensor):
         *inputs, conics = ctx.saved_tensors
         out = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs[:4]]
-        project.backward(*_arrays(*inputs), *ctx.options, *_arrays(conics, *grads[:4]), *_arrays(*out))
+        cotangents, targets = project.Projected(*_arrays(*grads[:4])), project.Splats(*_arrays(*out))
+        project.backward(*_given(inputs, ctx.options), *_arrays(conics), cotangents, targets)
         return *out, None, None
 
 
@@ -143,11 +149,10 @@ class Composite(torch.autograd.Function):
                 extra = np.empty((len(order), 0), np.float32) if extras is None else _arrays(extras[v])[0][order]
                 packed, starts, entries, first_slots = tiles.tile_lists(order, *splats, width, height)
                 spans = composite.spans(np.arange(len(starts) - 1), starts[1:], width, height)
-                drawn = packed, extra, spans, entries, width, height, shade_behind
-                final = np.empty((len(spans), composite.PIXELS), np.float32)
-                state = final, np.empty_like(final), np.empty((0, 4, composite.PIXELS), np.float32)
-                composite.forward(*drawn, rgb[v], alpha[v], image[v], *state)
-                rounds = [(order, first_slots, (*drawn, *state))]
+                work = records.Work(packed, extra, spans, entries, width, height, shade_behind)
+                state = records.State.empty(len(spans), 0)
+                composite.forward(work, records.Images(rgb[v], alpha[v], image[v]), state)
+                rounds = [(order, first_slots, work, state)]
             else:
                 find = partial(behind, v)
                 rounds = draw(find, order, z, radii[v].numpy(), splats, shade_behind, rgb[v], alpha[v])
@@ -162,24 +167,23 @@ class Composite(torch.autograd.Function):
     def backward(ctx, g_rgb: Tensor, g_alpha: Tensor, g_image: Tensor):
         (n, channels), (alpha,) = ctx.shapes, ctx.saved_tensors
         views = len(alpha)
-        sizes = (views, n, 2), (views, n, 3), (views, n, 3), (views, n), (views, n, channels)
-        g_means2d, g_conics, g_colors, g_opacities, g_extras = grads = [np.zeros(s, np.float32) for s in sizes]
+        sizes = (views, n, 2), (views, n, 3), (views, n), (views, n, 3), (views, n, channels)
+        grads = records.Gradients(*(np.zeros(size, np.float32) for size in sizes))
         g_background = np.zeros(3, np.float32) if ctx.needs_input_grad[5] else None
-        cotangents = [_arrays(g_rgb[v], g_alpha[v], g_image[v]) for v in range(views)]
-        for v, order, first_slots, drawn in ctx.lists:
-            slots = np.empty((int(first_slots[-1]), 9 + channels), np.float32)
-            used = np.zeros(len(slots), np.uint8)
-            composite.backward(*drawn, *cotangents[v], slots, used)
-            targets = g_means2d[v], g_conics[v], g_opacities[v], g_colors[v], g_extras[v]
-            composite.gather(order, first_slots, slots, used, *targets)
+        cotangents = [records.Images(*_arrays(g_rgb[v], g_alpha[v], g_image[v])) for v in range(views)]
+        for v, order, first_slots, work, state in ctx.lists:
+            pairs = int(first_slots[-1])
+            slots = records.Slots(np.empty((pairs, 9 + channels), np.float32), np.zeros(pairs, np.uint8))
+            composite.backward(work, state, cotangents[v], slots)
+            composite.gather(order, first_slots, slots, records.Gradients(*(grad[v] for grad in grads)))
         if g_background is not None:
             rows = np.empty((views, alpha.shape[1], 3), np.float32)
             for v in range(views):
-                composite.background_rows(alpha[v].numpy(), cotangents[v][0], rows[v])
+                composite.background_rows(alpha[v].numpy(), cotangents[v].rgb, rows[v])
             g_background += rows.sum(axis=(0, 1))
-        out = [torch.from_numpy(g) for g in grads]
+        means2d, conics, opacities, colors, extras = (torch.from_numpy(grad) for grad in grads)
         g_background = None if g_background is None else torch.from_numpy(g_background)
-        return *out[:4], out[4] if channels else None, g_background, *[None] * 5
+        return means2d, conics, colors, opacities, extras if channels else None, g_background, *[None] * 5
 
 
 BACKEND = Backend("cpu", rasterize, devices=("cpu",), dtypes=(torch.float32,), keeps_frozen=True)

@@ -12,10 +12,9 @@ from numba import njit, prange
 
 from ..thresholds import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .jit import kernel
-from .tiles import BLUE, GREEN, OPACITY, PX, PY, RED, RY, TILE_H, TILE_W, A, D, M, first_pixel, last_pixel
+from .tiles import BLUE, GREEN, OPACITY, PIXELS, PX, PY, RED, RY, TILE_H, TILE_W, A, D, M, first_pixel, last_pixel
 
 f32, u64 = np.float32, np.uint64
-PIXELS = TILE_W * TILE_H
 STRIDES = 64  # tasks: each takes every 64th tile, which evens out their work
 # Columns of a span, the work of one tile: its number; its rows of pixels that are drawn, top:bottom; its entries
 # begin:end; among them, first:after, outside of which no splat takes derivatives. An entry is a packed splat and its
@@ -190,13 +189,12 @@ def _walk(s, more, packed, extras, entries, begin, here, there, y0, top, bottom)
 
 
 @kernel(parallel=True, fastmath=True)
-def forward(packed, extras, spans, entries, width, height, background, rgb, alpha, image, final, last, rest):
-    """Fill the tiles of spans [S,7] in rgb [H,W,3], alpha [H,W,1] and image [H,W,E] of the extra channels extras [M,E],
-    and move each END to where the tile was finished.
-
-    For the backward pass: the transmittance `final` behind the entries before AFTER and the number of the last splat
-    `last` among them, both [S,PIXELS]; where there are entries from AFTER on, their colour and that of the background
-    and the transmittance behind everything, rest [S,4,PIXELS] (else not touched, and S may be 0)."""
+def forward(work, images, state):
+    """Fill the tiles of the Work's spans in the Images and the State, and move each END to where the tile was
+    finished."""
+    packed, extras, spans, entries, width, height, background = work
+    rgb, alpha, image = images
+    final, last, rest = state
     tiles_x, channels = -(-width // TILE_W), extras.shape[1]
     for task in prange(STRIDES):
         s, more = np.empty(ROWS * PIXELS, np.float32), np.empty((channels, PIXELS), np.float32)
@@ -242,13 +240,12 @@ def forward(packed, extras, spans, entries, width, height, background, rgb, alph
 
 
 @kernel(parallel=True, fastmath=True)
-def backward(
-    packed, extras, spans, entries, width, height, background, final, last, rest,
-    v_rgb, v_alpha, v_image, slots, used,
-):  # fmt: skip
-    """Fill slots [I,9+E] with the derivatives of each pair of splat and tile, and used [I] with 1 where there are any.
-    v_rgb [H,W,3], v_alpha [H,W,1], v_image [H,W,E]: the derivatives in the images of `forward`; all before them as
-    there."""
+def backward(work, state, cotangents, out):
+    """Fill the Slots `out` from the cotangents, the derivatives in the Images of `forward`."""
+    packed, extras, spans, entries, width, height, background = work
+    final, last, rest = state
+    v_rgb, v_alpha, v_image = cotangents
+    slots, used = out
     tiles_x, channels = -(-width // TILE_W), extras.shape[1]
     for task in prange(STRIDES):
         s, more = np.zeros(ROWS * PIXELS, np.float32), np.zeros((channels, PIXELS), np.float32)
@@ -312,8 +309,10 @@ def background_rows(alpha, v_rgb, rows):
 
 
 @kernel(parallel=True)
-def gather(order, first_slots, slots, used, g_means2d, g_conics, g_opacities, g_colors, g_extras):
-    """Sum the slots of each drawn splat, always in the same order, into the derivatives of splat order[j]."""
+def gather(order, first_slots, found, gradients):
+    """Sum the Slots of each drawn splat, always in the same order, into the Gradients of splat order[j]."""
+    slots, used = found
+    g_means2d, g_conics, g_opacities, g_colors, g_extras = gradients
     for j in prange(order.size):
         i = order[j]
         for k in range(first_slots[j], first_slots[j + 1]):

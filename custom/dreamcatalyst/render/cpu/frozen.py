@@ -12,12 +12,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numba import prange
 
-from .composite import AFTER, BEGIN, BOTTOM, END, FIRST, PIXELS, TILE, TOP, forward, spans
+from .composite import AFTER, BEGIN, BOTTOM, END, FIRST, TILE, TOP, forward, spans
 from .jit import kernel
+from .records import Images, State, Work
 from .tiles import PY, RY, TILE_H, TILE_W, depth_order, first_pixel, last_pixel, tile_lists
 
 f32 = np.float32
 NEAREST, MANY = 3, 4096  # of so many edited splats, this part of them is drawn before the rest is listed
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 MARGIN = 2  # tiles by which more is kept than is touched: edited splats move, and what they leave is made anew
 
 
@@ -50,10 +52,10 @@ def view(
     order = depth_order(depths, radii)
     packed, starts, entries, _ = tile_lists(order, means2d, conics, opacities, colors, width, height)
     rgb, alpha, none = (np.empty((height, width, c), np.float32) for c in (3, 1, 0))
-    state = [np.empty((len(starts) - 1, PIXELS), np.float32) for _ in range(2)]
     work = spans(np.arange(len(starts) - 1), starts[1:], width, height)
-    drawn = packed, np.empty((len(order), 0), np.float32), work, entries, width, height
-    forward(*drawn, np.zeros(3, np.float32), rgb, alpha, none, *state, np.empty((0, 4, PIXELS), np.float32))
+    black, extras = np.zeros(3, np.float32), np.empty((len(order), 0), np.float32)
+    drawn = Work(packed, extras, work, entries, width, height, black)
+    forward(drawn, Images(rgb, alpha, none), State.empty(len(work), 0))
 
     covered = _grown(touched, -(-width // TILE_W), -(-height // TILE_H))
     if known is not None:
@@ -65,9 +67,9 @@ def view(
     reach[finished] = z[entries[ends[finished] - 1, 0]]
     lengths = np.where(covered, ends - work[:, BEGIN], 0)
     kept = np.repeat(work[:, BEGIN] - np.cumsum(lengths) + lengths, lengths) + np.arange(lengths.sum())
-    drawn, entries = np.unique(entries[kept, 0], return_inverse=True)
+    seen, entries = np.unique(entries[kept, 0], return_inverse=True)
     starts = np.append(0, np.cumsum(lengths))
-    return View(rgb, alpha, covered, packed[drawn], z[drawn], reach, starts, entries.astype(np.int32))
+    return View(rgb, alpha, covered, packed[seen], z[seen], reach, starts, entries.astype(np.int32))
 
 
 def _grown(touched: np.ndarray, columns: int, rows: int) -> np.ndarray:
@@ -153,14 +155,14 @@ def _reach(order, means2d, radii, width, height, before, found):
 
 
 def draw(
-    find: Callable[[np.ndarray], View], order, depths, radii, splats: tuple, background, rgb, alpha
-) -> list[tuple[np.ndarray, np.ndarray, tuple]]:
+    find: Callable[[np.ndarray], View], order, depths, radii, splats: Arrays, background, rgb, alpha
+) -> list[tuple[np.ndarray, np.ndarray, Work, State]]:
     """Fill rgb [H,W,3] and alpha [H,W,1] with the frozen splats and the edited ones `order` [M] of depths [N].
 
     find: gives the view with the tiles (numbers) covered that it is given. radii [N]; splats: means2d, conics,
-    opacities and colors as for `tile_lists`. Returns (order, first_slots, arguments of `composite.backward`) of
-    each round: the nearest splats come first, and where these finish a tile, those behind are not even listed. The
-    other tiles are drawn anew with all.
+    opacities and colors as for `tile_lists`. Returns (order, first_slots, work, state) of each round: the nearest
+    splats come first, and where these finish a tile, those behind are not even listed. The other tiles are drawn anew
+    with all.
     """
     height, width, _ = alpha.shape
     tiles_x, tiles_y = -(-width // TILE_W), -(-height // TILE_H)
@@ -181,13 +183,13 @@ def draw(
         if not rounds:
             _paint(view.rgb, view.alpha, background, rgb, alpha)
         packed, work, entries = merge(view, packed, depths[chosen], horizon, starts, entries)
-        drawn = packed, np.empty((len(packed), 0), np.float32), work, entries, width, height, background
+        extras, none = np.empty((len(packed), 0), np.float32), np.empty((height, width, 0), np.float32)
+        drawn, state = Work(packed, extras, work, entries, width, height, background), State.empty(len(work), len(work))
         ends = work[:, END].copy()
-        state = [np.empty((len(work), *shape), np.float32) for shape in ((PIXELS,), (PIXELS,), (4, PIXELS))]
-        forward(*drawn, rgb, alpha, np.empty((height, width, 0), np.float32), *state)
+        forward(drawn, Images(rgb, alpha, none), state)
         if nearest:
             closed = work[:, END] < ends
             open_tiles[work[closed, TILE]] = False
             work[~closed, FIRST] = work[~closed, END]  # no derivatives: these tiles are drawn again
-        rounds.append((chosen, first_slots, (*drawn, *state)))
+        rounds.append((chosen, first_slots, drawn, state))
     return rounds

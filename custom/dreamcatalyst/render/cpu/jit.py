@@ -15,7 +15,8 @@ from ... import plugin
 _FOLDER = Path(__file__).parent
 _SOURCES = [*sorted(_FOLDER.glob("*.py")), _FOLDER.parent / "thresholds.py", _FOLDER.parent / "sh.py"]
 _DIGEST = hashlib.sha256(b"".join(path.read_bytes() for path in _SOURCES)).hexdigest()[:16]
-_CACHE = Path(numba.config.CACHE_DIR or _FOLDER / "__pycache__") / f"kernels-{_DIGEST}"
+_CONFIG: Any = numba.config  # its names are made at run time
+_CACHE = Path(_CONFIG.CACHE_DIR or _FOLDER / "__pycache__") / f"kernels-{_DIGEST}"
 
 
 class Cache(FunctionCache):
@@ -39,7 +40,7 @@ class Cache(FunctionCache):
             return None
 
 
-def kernel(**options) -> Callable:
+def kernel(**options: Any) -> Callable[[Callable], Any]:
     """`numba.njit(**options)` with a cache on disk that is valid for these very sources.
 
     numba looks only at the file in which a function stands; constants and functions that it takes from another file
@@ -47,13 +48,13 @@ def kernel(**options) -> Callable:
     take from.
     """
 
-    def decorate(function: Callable) -> Callable:
-        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_CACHE)
+    def decorate(function: Callable) -> Any:
+        before, _CONFIG.CACHE_DIR = _CONFIG.CACHE_DIR, str(_CACHE)
         try:
-            made = numba.njit(error_model="numpy", **options)(function)
+            made: Any = numba.njit(error_model="numpy", **options)(function)
             made._cache = Cache(function)  # what `cache=True` does, with a cache of ours
             return made
         finally:
-            numba.config.CACHE_DIR = before
+            _CONFIG.CACHE_DIR = before
 
     return decorate

@@ -8,6 +8,7 @@ not cancel for needles, where the usual three terms lose all digits in float32.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -16,6 +17,36 @@ from ..thresholds import ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR
 from .jit import kernel
 
 f32, i32 = np.float32, np.int32
+
+
+class Splats(NamedTuple):
+    """Raw parameters of N splats, or the derivatives in them; float32."""
+
+    means: np.ndarray  # [N,3] world units
+    quats: np.ndarray  # [N,4] wxyz, any norm
+    log_scales: np.ndarray  # [N,3] log of world units
+    logits: np.ndarray  # [N] of the opacities
+
+
+class Views(NamedTuple):
+    """V cameras of one size."""
+
+    viewmats: np.ndarray  # float32 [V,4,4] world to camera
+    Ks: np.ndarray  # float32 [V,3,3] pixels
+    width: int  # pixels
+    height: int
+    antialiased: bool  # whether opacities are compensated for the blur
+
+
+class Projected(NamedTuple):
+    """Splats in V views, or the derivatives in them; float32."""
+
+    means2d: np.ndarray  # [V,N,2] pixels
+    conics: np.ndarray  # [V,N,3]: a, m, d
+    depths: np.ndarray  # [V,N] world units
+    opacities: np.ndarray  # [V,N]
+
+
 ALPHA_MIN, BLUR, MARGIN, NEAR = f32(ALPHA_MIN), f32(BLUR), f32(FRUSTUM_MARGIN), f32(NEAR)
 ZERO, HALF, ONE, TWO, FOUR, TINY = f32(0), f32(0.5), f32(1), f32(2), f32(4), f32(1e-12)
 
@@ -117,13 +148,14 @@ def _radius(x, y, a, m, d, opacity, width, height):
 
 
 @kernel(parallel=True, fastmath={"contract"})
-def forward(
-    means, quats, log_scales, logits, views, Ks, width, height, antialiased, means2d, conics, depths, opacities, radii
-):
-    """Fill means2d [V,N,2], conics [V,N,3], depths, opacities (compensated if antialiased) and radii [V,N].
+def forward(splats, cameras, out, radii):
+    """Fill the Projected `out` and radii [V,N], int32 pixels, from Splats and Views.
 
     Splats behind the near plane get their depth only; their other entries are zero.
     """
+    means, quats, log_scales, logits = splats
+    views, Ks, width, height, antialiased = cameras
+    means2d, conics, depths, opacities = out
     for i in prange(means.shape[0]):
         m = _scaled(_rotation(_unit(quats, i)), _sizes(log_scales, i))
         for v in range(views.shape[0]):
@@ -200,11 +232,13 @@ def _covariance_gradient(ax, ay, conic, g, g_comp):
 
 
 @kernel(parallel=True, fastmath={"contract"})
-def backward(
-    means, quats, log_scales, logits, views, Ks, width, height, antialiased, conics,
-    g_means2d, g_conics, g_depths, g_opacities, g_means, g_quats, g_logs, g_logits,
-):  # fmt: skip
-    """Fill the derivatives in means [N,3], quats [N,4], log scales [N,3] and logits [N], summed over the views."""
+def backward(splats, cameras, conics, cotangents, out):
+    """Fill `out`, the derivatives in the Splats, summed over the views. conics [V,N,3]: those of `forward`; cotangents:
+    the derivatives in what it filled."""
+    means, quats, log_scales, logits = splats
+    views, Ks, width, height, antialiased = cameras
+    g_means2d, g_conics, g_depths, g_opacities = cotangents
+    g_means, g_quats, g_logs, g_logits = out
     for i in prange(means.shape[0]):
         q, s, opacity, g_logit = _unit(quats, i), _sizes(log_scales, i), _sigmoid(logits[i]), ZERO
         m = _scaled(_rotation(q), s)

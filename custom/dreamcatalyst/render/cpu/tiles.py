@@ -12,6 +12,7 @@ from .jit import kernel
 
 f32 = np.float32
 TILE_W, TILE_H = 8, 16  # pixels; a row is one vector of eight floats
+PIXELS = TILE_W * TILE_H
 CHUNKS = 32  # pieces into which the splats are cut for parallel counting, whatever the number of threads
 ALPHA_MIN = f32(ALPHA_MIN)
 ZERO, HALF, ONE = f32(0), f32(0.5), f32(1)

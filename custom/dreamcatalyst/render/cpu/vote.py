@@ -52,8 +52,9 @@ def count(scene: Gaussians, camera: Cameras, mask: Tensor, antialiased: bool) ->
     means2d, conics, depths, opacities = (np.empty((1, n, *rest), np.float32) for rest in ((2,), (3,), (), ()))
     radii = np.empty((1, n), np.int32)
     inputs = scene.means, scene.quats, scene.log_scales, scene.logit_opacities, camera.viewmats, camera.Ks
-    arrays = [tensor.contiguous().numpy() for tensor in inputs]
-    project.forward(*arrays, *size, antialiased, means2d, conics, depths, opacities, radii)
+    *splats, viewmats, Ks = (tensor.contiguous().numpy() for tensor in inputs)
+    views, out = project.Views(viewmats, Ks, *size, antialiased), project.Projected(means2d, conics, depths, opacities)
+    project.forward(project.Splats(*splats), views, out, radii)
     order = tiles.depth_order(depths[0], radii[0])
     colors = np.zeros((n, 3), np.float32)
     packed, starts, entries, first = tiles.tile_lists(order, means2d[0], conics[0], opacities[0], colors, *size)
