@@ -36,6 +36,7 @@ class Row:
 class Prior(ABC):
     """A conditional denoiser on latents. Images are [B,3,H,W] in [0,1]; latents [B,C,h,w].
 
+    config: the options that it was built with; a relevance mask that was kept is found again by them.
     alphas_cumprod [T] float64 on the CPU: abar_t of timestep index t = 0..T-1 (Ho et al. 2020).
     takes_image: whether the image condition means anything (False for text-to-image models).
     exact: whether the edit of an image is known in closed form (`known_edit`).
@@ -44,6 +45,7 @@ class Prior(ABC):
     instructions: all that the prior was taught, wordings by edit; None where it is open to any.
     """
 
+    config: Any
     alphas_cumprod: Tensor
     takes_image: bool = True
     exact: bool = False

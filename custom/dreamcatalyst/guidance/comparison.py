@@ -16,7 +16,7 @@ from .distill import check_prior
 from .edited_views import EditedViews
 from .fixed_point import with_wide_spread
 from .objective import Objective, Step
-from .oracle import known_edit
+from .oracle import exact_edit
 from .prompted import PromptedPrior
 from .rules import Replacement
 
@@ -36,7 +36,7 @@ class Comparison(Objective):
         self.prompted, self.rule = prompted, rule
 
     def balanced(self) -> Prior:
-        return with_wide_spread(self.prompted.prior)
+        return with_wide_spread(self.prompted.closed_form)
 
     @abstractmethod
     def target(self, render: Tensor, source: Tensor, view: int, step: int) -> Tensor:
@@ -60,9 +60,10 @@ class KnownEdit(Comparison):
     """The edit itself, where the prior knows it: what a method can reach at best."""
 
     def target(self, render: Tensor, source: Tensor, view: int, step: int) -> Tensor:
-        return known_edit(self.prompted, source, view)
+        return exact_edit(self.prompted, source, view, self.prompted.text)
 
-    picture = target
+    def picture(self, render: Tensor, source: Tensor, index: int, step: int) -> Tensor:
+        return self.target(render, source, index, step)
 
 
 class DatasetUpdate(Comparison):

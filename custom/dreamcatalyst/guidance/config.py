@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -67,8 +68,8 @@ def chosen_rule(config: GuidanceConfig) -> Rule | Replacement:
     return get_rule(config.rule, config.preset, **{k: v for k, v in given.items() if v is not None})
 
 
-def chosen_prior(config: GuidanceConfig) -> tuple[type[Prior], Any]:
-    """The prior's class and its options; nothing is loaded. Raises ConfigError."""
+def chosen_prior(config: GuidanceConfig) -> tuple[Callable[..., Prior], Any]:
+    """The prior's class, called with (options, device=...), and its options; nothing is loaded. Raises ConfigError."""
     cls = PRIORS.get(config.prior_type, "system.guidance.prior_type")
     return cls, parse(cls.Config, config.prior, "system.guidance.prior")
 

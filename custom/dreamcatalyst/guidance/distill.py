@@ -43,7 +43,8 @@ def distillation_gradient(
     a, b = rule.weights(timestep, prior.alphas_cumprod)
     _check_latents(rule, x, x_src, noise, b)
     full = torch.promote_types(x.dtype, torch.float32)
-    x, noise, x_src = x.to(full), noise.to(full), None if x_src is None else x_src.to(full)
+    x, noise = x.to(full), noise.to(full)
+    x_src = x if x_src is None else x_src.to(full)  # None: nothing below reads it, _check_latents has seen to that
     gradient = torch.zeros_like(x)
     if a != 0.0:
         abar = abar_at(prior.alphas_cumprod, timestep)
@@ -69,9 +70,7 @@ def network_rows(
     return len(difference_rows(edit, reference, prior.takes_image))
 
 
-def _reference(
-    rule: Rule, edit: Branch, x_src: Tensor | None, noise: Tensor, abar: float, source_text: Any
-) -> Branch | None:
+def _reference(rule: Rule, edit: Branch, x_src: Tensor, noise: Tensor, abar: float, source_text: Any) -> Branch | None:
     """The branch of eps_ref, None where it is the injected noise."""
     scales = (edit.guidance_scale, edit.image_guidance_scale)
     if rule.reference == EDIT_NULL:

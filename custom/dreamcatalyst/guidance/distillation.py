@@ -47,11 +47,11 @@ class Distillation(Objective):
         return self.prompted.schedule.timestep(step, max_steps, self.prompted.prior.alphas_cumprod)
 
     def balanced(self) -> Prior:
-        return balanced(self.prompted.prior, self.rule, self.resting_timesteps, *self.prompted.scales)
+        return balanced(self.prompted.closed_form, self.rule, self.resting_timesteps, *self.prompted.scales)
 
     def check_sampler(self) -> None:
         if self.prompted.prior.exact:
-            check_sampler(self.prompted.prior, self.rule, self.sampler_timesteps, *self.prompted.scales)
+            check_sampler(self.prompted.closed_form, self.rule, self.sampler_timesteps, *self.prompted.scales)
 
     def expected(self, source: Tensor, index: int, timestep: int | None = None) -> Tensor | None:
         timesteps = self.resting_timesteps if timestep is None else [timestep]

@@ -14,7 +14,7 @@ from .rules import Rule
 
 def known_edit(prompted: PromptedPrior, source: Tensor, index: int) -> Tensor | None:
     """The edit that the prior knows of a view's source render, [H,W,3] in [0,1]; None for a prior that learned."""
-    return _edit(prompted, source, index, prompted.text) if prompted.prior.exact else None
+    return exact_edit(prompted, source, index, prompted.text) if prompted.prior.exact else None
 
 
 def resting_picture(
@@ -24,13 +24,15 @@ def resting_picture(
     or not stable."""
     if not prompted.prior.exact:
         return None
-    rest = fixed_point(prompted.prior, rule, timesteps, *prompted.scales)
+    rest = fixed_point(prompted.closed_form, rule, timesteps, *prompted.scales)
     if rest is None:
         return None
-    edit = _edit(prompted, source, index, prompted.text) - _edit(prompted, source, index, prompted.source_text)
+    edit, reference = (exact_edit(prompted, source, index, text) for text in (prompted.text, prompted.source_text))
     from_mean = source - (prompted.prior.config.mu + 1.0) / 2.0
-    return (source + rest.rho * edit + rest.drift * from_mean).clamp(0, 1)
+    return (source + rest.rho * (edit - reference) + rest.drift * from_mean).clamp(0, 1)
 
 
-def _edit(prompted: PromptedPrior, source: Tensor, index: int, text: Any) -> Tensor:
+def exact_edit(prompted: PromptedPrior, source: Tensor, index: int, text: Any) -> Tensor:
+    """What `text` (of `Prior.embed`) makes of a view's source render, [H,W,3] in [0,1]. Raises PriorError for a prior
+    that is not exact."""
     return prompted.prior.known_edit(prompted.encode_source(source, index)[1], text)[0].permute(1, 2, 0)

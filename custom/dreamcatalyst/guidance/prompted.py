@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from ..cache import ByteCache
 from ..diffusion.api import Prior
+from ..diffusion.closed_form import ClosedForm
 from ..diffusion.noise import keyed_generator, keyed_noise
 from .config import GuidanceConfig
 from .ddim import edit_image
@@ -33,6 +34,11 @@ class PromptedPrior:
     def scales(self) -> tuple[float, float]:
         """(w_y, w_I)."""
         return self.config.guidance_scale, self.config.condition_scale
+
+    @property
+    def closed_form(self) -> ClosedForm:
+        """The prior, to be asked for where it is `exact`: then it has spreads, a mean and known edits."""
+        return cast(ClosedForm, self.prior)
 
     # --- source views
 

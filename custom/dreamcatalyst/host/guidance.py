@@ -67,15 +67,18 @@ class HostGuidance(plugin.BaseObject):
 
     def configure(self) -> None:
         self._epoch = self._step = 0
-        ours = {f.name: self.cfg[f.name] for f in fields(GuidanceConfig)} | {"prior": prior_options(self.cfg)}
+        ours = {f.name: getattr(self.cfg, f.name) for f in fields(GuidanceConfig)} | {"prior": prior_options(self.cfg)}
         self._settings: GuidanceConfig = parse(GuidanceConfig, {**ours, **self._limits(0, 0)}, "system.guidance")
         self.rule = chosen_rule(self._settings)
         self.schedule = chosen_schedule(self._settings, self.rule)
-        for time in {time for name in LIMITS if self.cfg[name] is not None for time in corners(self.cfg[name])}:
+        limits = [limit for name in LIMITS if (limit := getattr(self.cfg, name)) is not None]
+        for time in {time for limit in limits for time in corners(limit)}:
             chosen_schedule(replace(self._settings, **self._limits(time, time)), self.rule)  # where they are extreme
         self._references = self._find_references()
         unused = [
-            f"system.guidance.{name} ({why})" for name, why in WITHOUT_EFFECT.items() if self.cfg[name] is not None
+            f"system.guidance.{name} ({why})"
+            for name, why in WITHOUT_EFFECT.items()
+            if getattr(self.cfg, name) is not None
         ]
         if unused:
             plugin.info(f"keys of another guidance, which have no effect on {type(self).__name__}: {', '.join(unused)}")
@@ -93,10 +96,10 @@ class HostGuidance(plugin.BaseObject):
         """The limits of the noise level from now on; some of the host's systems set them."""
         self.cfg.min_step_percent, self.cfg.max_step_percent = min_step_percent, max_step_percent
 
-    def _limits(self, epoch: int, step: int) -> dict[str, float]:
+    def _limits(self, epoch: float, step: float) -> dict[str, float]:
         """The limits of the noise level that are set; they may follow a schedule."""
-        set_here = [name for name in LIMITS if self.cfg[name] is not None]
-        return {name: plugin.C(self.cfg[name], epoch, step) for name in set_here}
+        limits = {name: getattr(self.cfg, name) for name in LIMITS}
+        return {name: plugin.C(limit, epoch, step) for name, limit in limits.items() if limit is not None}
 
     def settings(self) -> GuidanceConfig:
         """The guidance's config at this moment."""
@@ -125,11 +128,11 @@ class HostGuidance(plugin.BaseObject):
 
     # --- images
 
-    def _encoded_size(self, rgb: Tensor) -> tuple[int, int]:
+    def _encoded_size(self, rgb: Tensor) -> tuple[int, ...]:
         return (self.cfg.fixed_size, self.cfg.fixed_size) if self.cfg.fixed_size > 0 else tuple(rgb.shape[1:3])
 
     @staticmethod
-    def _resized(images: Tensor, size: tuple[int, int]) -> Tensor:
+    def _resized(images: Tensor, size: Sequence[int]) -> Tensor:
         if tuple(images.shape[1:3]) == tuple(size):
             return images
         resized = F.interpolate(images.permute(0, 3, 1, 2), tuple(size), mode="bilinear", antialias=True)
@@ -182,25 +185,25 @@ class HostGuidance(plugin.BaseObject):
         if not processors:
             raise ConfigError("system.guidance.prompt: is empty, and this system passes no prompt processor's output")
         asked = processors[: 2 if self.rule.reads_source_text and not self.cfg.source_prompt else 1]
-        if guidance.prior.exact:
-            texts = guidance.prior.embed([processor.prompt for processor in asked])
+        prior: Any = guidance.prior  # whose text has a width, and a null_text in place of the empty prompt's
+        if prior.exact:
+            texts = prior.embed([processor.prompt for processor in asked])
         else:
-            pairs = [self._host_text(guidance, processor, batch) for processor in asked]
-            texts, guidance.prior.null_text = [text for text, _ in pairs], pairs[0][1]
+            pairs = [self._host_text(prior, processor, batch) for processor in asked]
+            texts, prior.null_text = [text for text, _ in pairs], pairs[0][1]
         guidance.text = texts[0]
         if len(texts) > 1:
             guidance.source_text = texts[1]
 
-    def _host_text(self, guidance: Guidance, processor: Any, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    def _host_text(self, prior: Any, processor: Any, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Embeddings [B or 1,L,D] of the prompt and of the negative prompt."""
         directed = self.cfg.view_dependent_prompting and "elevation" in batch
         angles = [batch[name] if directed else torch.zeros(1) for name in ("elevation", "azimuth", "camera_distances")]
         rows = processor.get_text_embeddings(*angles, view_dependent_prompting=directed)
-        width = guidance.prior.text_width
-        if rows.shape[-1] != width:
+        if rows.shape[-1] != prior.text_width:
             raise ConfigError(
                 f"system.prompt_processor: gives text embeddings of width {rows.shape[-1]}, and the U-Net of "
-                f"{guidance.prior.config.path} takes {width}. Set system.prompt_processor_type="
+                f"{prior.config.path} takes {prior.text_width}. Set system.prompt_processor_type="
                 "stable-diffusion-prompt-processor, system.prompt_processor.pretrained_model_name_or_path to a model "
                 "with that text encoder (768: Stable Diffusion 1.5), or system.guidance.prompt for the prior's own."
             )
