@@ -161,8 +161,14 @@ def _find(config: MaskConfig, segmenter: Segmenter, request: MaskRequest) -> tup
     evidence = sum_evidence(config, request, images)
     if config.vote == "gaussian-editor":
         return evidence.inside / (evidence.total + 1e-7), images  # never seen: 0
-    options = dict(min_evidence=config.min_evidence, neighbours=config.neighbours)
-    return masks.soft_weights(request.scene.means, evidence.inside, evidence.total, **options), images
+    weights = masks.soft_weights(
+        request.scene.means,
+        evidence.inside,
+        evidence.total,
+        min_evidence=config.min_evidence,
+        neighbours=config.neighbours,
+    )
+    return weights, images
 
 
 def sum_evidence(config: MaskConfig, request: MaskRequest, images: dict[int, Tensor]) -> Evidence:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -40,7 +41,7 @@ class Box(Segmenter):
         if len(given) != 1 or None in given[0]:
             names = [name for name in self.__dataclass_fields__ if getattr(self, name) is not None]
             raise ConfigError(f"got {', '.join(names) or 'nothing'}, expected one of: {FORMS}.")
-        if self.low and not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+        if self.low and self.high and not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ConfigError(f"low: {self.low} must lie below high, {self.high}, along each axis.")
         if self.window and not (self.window[0] < self.window[2] and self.window[1] < self.window[3]):
             raise ConfigError(f"window: got {self.window}, expected left < right and top < bottom.")
@@ -51,31 +52,32 @@ class Box(Segmenter):
         def here(point: tuple[float, float, float]) -> Tensor:
             return means.new_tensor([a - b for a, b in zip(point, request.origin, strict=True)])
 
-        if self.low:
+        if self.low and self.high:
             return ((means >= here(self.low)) & (means <= here(self.high))).all(dim=1).to(means)
-        if self.center:
+        if self.center and self.radius is not None:
             return ((means - here(self.center)).norm(dim=1) <= self.radius).to(means)
         number = self.number(request)
         return {number: self.rectangle(request.cameras[number].width, request.cameras[number].height)}
 
     def number(self, request: MaskRequest) -> int:
         """The view that is meant, of all in the capture: by name, or else by number."""
-        if self.view in request.names:
-            return list(request.names).index(self.view)
-        if self.view.isdecimal() and int(self.view) < len(request.names):
-            return int(self.view)
+        view = cast(str, self.view)  # there is one where there is no box and no sphere
+        if view in request.names:
+            return list(request.names).index(view)
+        if view.isdecimal() and int(view) < len(request.names):
+            return int(view)
         raise ConfigError(
-            f"system.mask.options.view: no view '{self.view}'.{nearest(self.view, request.names)} "
+            f"system.mask.options.view: no view '{view}'.{nearest(view, request.names)} "
             f"Known: the names of the {len(request.names)} views, or 0 to {len(request.names) - 1}."
         )
 
     def rectangle(self, width: int, height: int) -> Tensor:
         """The window as a mask [height,width]; a pixel that is cut counts by the part that lies inside."""
-        left, top, right, bottom = self.window
-        if max(self.window) <= 1:
+        left, top, right, bottom = window = cast(Window, self.window)  # it comes with the view
+        if max(window) <= 1:
             left, top, right, bottom = left * width, top * height, right * width, bottom * height
         if left >= width or top >= height:
-            raise ConfigError(f"system.mask.options.window: {self.window} lies outside of the view, {width}x{height}.")
+            raise ConfigError(f"system.mask.options.window: {window} lies outside of the view, {width}x{height}.")
         x, y = torch.arange(width, dtype=torch.float32), torch.arange(height, dtype=torch.float32)
         columns = (torch.minimum(x + 1, x.new_tensor(right)) - torch.maximum(x, x.new_tensor(left))).clamp(0, 1)
         rows = (torch.minimum(y + 1, y.new_tensor(bottom)) - torch.maximum(y, y.new_tensor(top))).clamp(0, 1)

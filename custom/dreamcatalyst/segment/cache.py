@@ -31,7 +31,7 @@ def _update(state: Any, part: Any) -> None:
         part = part.detach().cpu().contiguous().numpy()
     if isinstance(part, np.ndarray):
         state.update(f"array {part.dtype} {part.shape} ".encode())
-        state.update(memoryview(np.ascontiguousarray(part)).cast("B") if part.size else b"")
+        state.update(np.ascontiguousarray(part).data.cast("B") if part.size else b"")
     elif dataclasses.is_dataclass(part):
         _update(state, (type(part).__qualname__, {f.name: getattr(part, f.name) for f in dataclasses.fields(part)}))
     elif isinstance(part, Mapping):

@@ -20,9 +20,15 @@ def overlay(image: Tensor, mask: Tensor, strength: float = 0.5) -> Tensor:
 @torch.no_grad()
 def rendered_mask(mask: Tensor, request: MaskRequest, view: int) -> Tensor:
     """A mask of splats [N] as one view sees it, [H,W] in [0,1]."""
-    options = dict(sh_degree=0, backend=request.backend, antialiased=request.antialiased)
-    features = mask.to(request.scene.means)[:, None]
-    return rasterize(request.scene, request.cameras[view], features=features, **options).features[0, ..., 0]
+    seen = rasterize(
+        request.scene,
+        request.cameras[view],
+        sh_degree=0,
+        features=mask.to(request.scene.means)[:, None],
+        antialiased=request.antialiased,
+        backend=request.backend,
+    )
+    return seen.features[0, ..., 0]
 
 
 def mask_panels(found: Mask, request: MaskRequest, view: int) -> list[tuple[str, Tensor]]:
