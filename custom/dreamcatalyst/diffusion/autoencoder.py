@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..errors import PriorError
@@ -26,7 +27,7 @@ class Autoencoder:
     """
 
     def __init__(
-        self, vae: nn.Module, folder: Folder, *, sample: bool = False, seed: int = 0, unit_condition: bool = False
+        self, vae: Any, folder: Folder, *, sample: bool = False, seed: int = 0, unit_condition: bool = False
     ):
         self.vae, self.factor, self.sample, self.seed = vae, folder.factor, sample, seed
         self.unit_condition = unit_condition
@@ -118,7 +119,7 @@ def _keep_gradient_in_range(inside: Tensor, outside: Tensor) -> None:
     inside.register_hook(lambda grad: grad * magnitude[0])
 
 
-def load_autoencoder(folder: Folder, tiny: str | None, dtype: torch.dtype) -> nn.Module:
+def load_autoencoder(folder: Folder, tiny: str | None, dtype: torch.dtype) -> Any:
     """The folder's AutoencoderKL, or the AutoencoderTiny at `tiny` (a folder or a Hugging Face id), which must have as
     many latent channels and the same factor. Raises PriorError."""
     from diffusers import AutoencoderKL, AutoencoderTiny

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -16,6 +17,9 @@ from ..errors import PriorError
 from .api import Prior, Row
 from .noise import abar_at, stable_diffusion_schedule
 from .operators import Operator, find_operator
+
+
+Form = TypeVar("Form", bound="ClosedForm")
 
 
 @dataclass(frozen=True)
@@ -54,8 +58,9 @@ class SourceImage:
         joined = SourceImage(torch.cat([part.latents for part in parts]))
         for name in set.intersection(*(set(part._edited) for part in parts)):
             joined._edited[name] = torch.cat([part._edited[name] for part in parts])
-        if all(part._known is not None for part in parts):
-            joined._known = torch.cat([part._known for part in parts])
+        known = [part._known for part in parts if part._known is not None]
+        if len(known) == len(parts):
+            joined._known = torch.cat(known)
         return joined
 
 
@@ -97,7 +102,7 @@ class ClosedForm(Prior):
     def known_edit(self, condition: SourceImage, text: Operator | None) -> Tensor:
         return self.decode(condition.latents if text is None else condition.edited(text))
 
-    def with_spread(self, spread: float) -> ClosedForm:
+    def with_spread(self: Form, spread: float) -> Form:
         """The same prior with s_image = s_null = spread."""
         return type(self)(replace(self.config, s_image=spread, s_null=spread), alphas_cumprod=self.alphas_cumprod)
 

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -79,7 +79,7 @@ class Folder:
         because rules that divide by 1 - abar_t / abar_{t-1} would see the rounding of a float32 product."""
         from diffusers import DDPMScheduler
 
-        scheduler = _built(self.path / "scheduler", lambda: DDPMScheduler.from_config(self.scheduler))
+        scheduler = _built(self.path / "scheduler", lambda: cast(DDPMScheduler, DDPMScheduler.from_config(self.scheduler)))
         return torch.cumprod(1 - scheduler.betas.double(), dim=0)
 
 
@@ -233,7 +233,7 @@ def check_memory(folder: Folder, dtype: torch.dtype, device: torch.device, *, of
                 lambda: CLIPTextModel(CLIPTextConfig.from_dict(folder.text_encoder)),
             ),
         ]
-        vae = [] if tiny else [_built(folder.path / "vae", lambda: AutoencoderKL.from_config(folder.vae))]
+        vae = [] if tiny else [_built(folder.path / "vae", lambda: cast(nn.Module, AutoencoderKL.from_config(folder.vae)))]
 
     def size(module: nn.Module) -> int:
         return sum(p.numel() for p in module.parameters()) * dtype.itemsize
@@ -248,7 +248,7 @@ def check_memory(folder: Folder, dtype: torch.dtype, device: torch.device, *, of
         )
 
 
-def load(kind: type, path: str | Path, subfolder: str | None, dtype: torch.dtype) -> nn.Module:
+def load(kind: type, path: str | Path, subfolder: str | None, dtype: torch.dtype) -> Any:
     """A frozen model of diffusers or transformers in evaluation mode, every weight found. Raises PriorError."""
     from diffusers import ModelMixin
     from diffusers.utils import is_accelerate_available
@@ -258,7 +258,7 @@ def load(kind: type, path: str | Path, subfolder: str | None, dtype: torch.dtype
     if issubclass(kind, ModelMixin):
         options |= {"torch_dtype": dtype, "low_cpu_mem_usage": is_accelerate_available()}
     try:
-        model, info = kind.from_pretrained(str(path), output_loading_info=True, **options)
+        model, info = cast(Any, kind).from_pretrained(str(path), output_loading_info=True, **options)
     except Exception as error:  # each way to store weights raises its own kinds
         raise PriorError(
             f"{where}: cannot be loaded as {kind.__name__}: {_first_line(error)} "

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -58,13 +58,13 @@ class Site(NamedTuple):
     stage: int
 
 
-def freeu_sites(unet: nn.Module) -> list[Site]:
+def freeu_sites(unet: Any) -> list[Site]:
     """The sites of the paper's code, stated relatively to the U-Net's widest block: 7 of stage 1 and 3 of stage 2 on
     Stable Diffusion 1.5 (all blocks of up-blocks 0 and 1 and the first of 2; the last two of 2 and the first of 3)."""
     return [site for site in _decoder(unet) if site.stage]
 
 
-def _decoder(unet: nn.Module) -> Iterator[Site]:
+def _decoder(unet: Any) -> Iterator[Site]:
     """Every residual block of the decoder in running order; stage 0 where FreeU has no business."""
     widest = max(unet.config.block_out_channels)
     stages = {widest: 1, widest / 2: 2}
@@ -107,7 +107,7 @@ class FreeU:
     Where b = s = 1 nothing is hooked and the U-Net's output is the same to the bit.
     """
 
-    def __init__(self, unet: nn.Module, config: FreeUConfig):
+    def __init__(self, unet: Any, config: FreeUConfig):
         self.unet, self.config = unet, config
         self._handles: list = []
         self._active = {stage: bs for stage, bs in config.factors.items() if config.mode != "none" and bs != (1, 1)}

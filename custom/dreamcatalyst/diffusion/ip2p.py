@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -130,7 +131,7 @@ class LatentDiffusion(Prior):
         models = self.unet, self.text_encoder, self.autoencoder.vae
         return sum(p.numel() * p.element_size() for model in models for p in model.parameters())
 
-    def _apply_options(self, vae: nn.Module) -> None:
+    def _apply_options(self, vae: Any) -> None:
         if self.config.slicing:
             vae.enable_slicing()
         if self.config.tiling:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -57,10 +58,11 @@ def _ramp(image: ndarray, *stops: tuple[float, float, float]) -> ndarray:
     x = _luma(image)
     degree = len(stops) - 1
     weights = [1.0, *np.cumprod([(degree - k) / (k + 1) for k in range(degree)])]
-    return sum(
+    terms = (
         float(w) * x**k * (1.0 - x) ** (degree - k) * np.asarray(stop, dtype=image.dtype)
         for k, (w, stop) in enumerate(zip(weights, stops, strict=True))
     )
+    return cast(ndarray, sum(terms))  # not the int of an empty sum: there are stops
 
 
 def _smooth(x: ndarray, low: float, high: float) -> ndarray:
