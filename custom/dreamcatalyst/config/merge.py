@@ -10,7 +10,7 @@ import functools
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -44,7 +44,7 @@ def merge_open(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: An
 
 def _merged(below: DictConfig, above: DictConfig) -> DictConfig:
     _require_keys(OmegaConf.to_container(below), OmegaConf.to_container(above))
-    return OmegaConf.merge(below, above)
+    return cast(DictConfig, OmegaConf.merge(below, above))
 
 
 def _require_keys(below: Any, above: Any, where: str = "") -> None:
@@ -99,7 +99,7 @@ def _read(path: Path, where: str) -> DictConfig:
         raise ConfigError(f"{where}: there is no file '{path}'.{nearest(str(path), there)}{known}")
     try:
         content = yaml.compose(path.read_text(encoding="utf-8"))
-        loaded = OmegaConf.load(path) if isinstance(content, yaml.MappingNode) else None
+        loaded = cast(DictConfig, OmegaConf.load(path)) if isinstance(content, yaml.MappingNode) else None
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)

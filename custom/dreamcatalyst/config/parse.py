@@ -89,7 +89,7 @@ def _convert(hint: Any, raw: Any, place: str, default: Any) -> Any:
     hint, *notes = _notes(hint)
     if notes:
         return _ranged(hint, notes, raw, place)
-    if dataclasses.is_dataclass(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return parse(hint, raw, place, default if isinstance(default, hint) else None)
     if hint is Any or (hint is dict and isinstance(raw, DictConfig)) or (hint is str and isinstance(raw, str)):
         return raw
@@ -121,7 +121,8 @@ def _ranged(hint: Any, notes: Sequence, raw: Any, place: str) -> Any:
     """`raw` as an annotated number: a schedule where that is among the notes, and inside the range that is."""
     schedule = "schedule" in notes
     result = read_scalar(raw, place) if schedule else _convert(hint, raw, place, None)
-    for number in values_of(result) if schedule else [result]:
+    numbers: list[Any] = values_of(result) if schedule else [result]
+    for number in numbers:
         for limits in notes:
             if isinstance(limits, Range) and number not in limits:
                 within = f" in {shown(raw)}" if isinstance(result, tuple) else f" ({type(number).__name__})"

@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -28,7 +28,7 @@ def read_config(merged: DictConfig, below: Callable[[], Iterable[str]] = tuple) 
     A run that resumes from `<trial>/ckpts/x.ckpt` gets that trial's folder. below: the dotted keys that sections take,
     asked for where a key is unknown: it may be one of them without its section.
     """
-    plain = OmegaConf.to_container(merged)
+    plain = cast(dict[str, Any], OmegaConf.to_container(merged))
     known = [f.name for f in dataclasses.fields(ExperimentConfig)]
     for key in plain:
         if key not in known:
@@ -81,7 +81,8 @@ def save_config(config: ExperimentConfig, path: Path, merged: DictConfig | None 
     follows from other keys there is written so, and follows them again where the file is loaded with another length."""
     told = {f.name: escaped(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if merged is not None:
-        told |= {key: value for key, value in OmegaConf.to_container(merged).items() if key not in _FOUND}
+        plain = cast(dict[str, Any], OmegaConf.to_container(merged))
+        told |= {key: value for key, value in plain.items() if key not in _FOUND}
     write_text(path, OmegaConf.to_yaml(OmegaConf.create(told)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard, cast
 
 from omegaconf import OmegaConf
 
@@ -24,12 +24,12 @@ def shown(raw: Any) -> str:
     return f"{text if len(text) <= 80 else text[:77] + '...'} ({type(plain).__name__})"
 
 
-def is_list(raw: Any) -> bool:
+def is_list(raw: Any) -> TypeGuard[Sequence[Any]]:
     """Whether this is a list or a tuple, or what OmegaConf makes of one."""
     return isinstance(raw, Sequence) and not isinstance(raw, (str, bytes))
 
 
-def is_number(raw: Any) -> bool:
+def is_number(raw: Any) -> TypeGuard[int | float]:
     """Whether this is an int or a float, and no bool."""
     return isinstance(raw, (int, float)) and not isinstance(raw, bool)
 
@@ -72,6 +72,11 @@ def _knots(schedule: Sequence[int | float]) -> list[tuple[int | float, int | flo
     return [(start, first)] + [(rest[i + 1], rest[i]) for i in range(0, len(rest), 2)]
 
 
+def _corners(scalar: Any) -> list[tuple[int | float, int | float]]:
+    """`_knots` of a schedule as it was given. Raises ConfigError."""
+    return _knots(cast(tuple, read_scalar(scalar, "schedule")))
+
+
 def value(scalar: Scalar | Sequence, epoch: int, step: int, interpolation: str = "linear") -> float:
     """The value of a number or schedule at `epoch` and global `step`; threestudio's `C`, clock rule included.
 
@@ -81,7 +86,7 @@ def value(scalar: Scalar | Sequence, epoch: int, step: int, interpolation: str =
     """
     if is_number(scalar):
         return scalar
-    knots = _knots(read_scalar(scalar, "schedule"))
+    knots = _corners(scalar)
     piece = sum(step >= time for time, _ in knots[1:-1])
     (start, first), (end, last) = knots[piece : piece + 2]
     now = step if isinstance(end, int) else epoch
@@ -95,7 +100,7 @@ def value(scalar: Scalar | Sequence, epoch: int, step: int, interpolation: str =
 
 def values_of(scalar: Scalar | Sequence) -> list[float]:
     """The values at the corners of a schedule, between which it stays; of a number, that."""
-    return [scalar] if is_number(scalar) else [v for _, v in _knots(read_scalar(scalar, "schedule"))]
+    return [scalar] if is_number(scalar) else [v for _, v in _corners(scalar)]
 
 
 def largest(scalar: Scalar | Sequence) -> float:
@@ -105,4 +110,4 @@ def largest(scalar: Scalar | Sequence) -> float:
 
 def corners(scalar: Scalar | Sequence) -> list[int | float]:
     """The times at which the pieces of a schedule begin and end, in steps or epochs; [0] for a number."""
-    return [0] if is_number(scalar) else [time for time, _ in _knots(read_scalar(scalar, "schedule"))]
+    return [0] if is_number(scalar) else [time for time, _ in _corners(scalar)]

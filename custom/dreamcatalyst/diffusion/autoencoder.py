@@ -26,9 +26,7 @@ class Autoencoder:
     `decode` crops there: no pixel ever moves.
     """
 
-    def __init__(
-        self, vae: Any, folder: Folder, *, sample: bool = False, seed: int = 0, unit_condition: bool = False
-    ):
+    def __init__(self, vae: Any, folder: Folder, *, sample: bool = False, seed: int = 0, unit_condition: bool = False):
         self.vae, self.factor, self.sample, self.seed = vae, folder.factor, sample, seed
         self.unit_condition = unit_condition
         self.scale, self.shift = folder.scaling_factor, folder.shift_factor

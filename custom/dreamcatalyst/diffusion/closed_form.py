@@ -18,7 +18,6 @@ from .api import Prior, Row
 from .noise import abar_at, stable_diffusion_schedule
 from .operators import Operator, find_operator
 
-
 Form = TypeVar("Form", bound="ClosedForm")
 
 

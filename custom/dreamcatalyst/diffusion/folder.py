@@ -79,8 +79,8 @@ class Folder:
         because rules that divide by 1 - abar_t / abar_{t-1} would see the rounding of a float32 product."""
         from diffusers import DDPMScheduler
 
-        scheduler = _built(self.path / "scheduler", lambda: cast(DDPMScheduler, DDPMScheduler.from_config(self.scheduler)))
-        return torch.cumprod(1 - scheduler.betas.double(), dim=0)
+        scheduler = _built(self.path / "scheduler", lambda: DDPMScheduler.from_config(self.scheduler))
+        return torch.cumprod(1 - cast(DDPMScheduler, scheduler).betas.double(), dim=0)
 
 
 def open_folder(path: str, conditioned: bool) -> Folder:
@@ -233,12 +233,12 @@ def check_memory(folder: Folder, dtype: torch.dtype, device: torch.device, *, of
                 lambda: CLIPTextModel(CLIPTextConfig.from_dict(folder.text_encoder)),
             ),
         ]
-        vae = [] if tiny else [_built(folder.path / "vae", lambda: cast(nn.Module, AutoencoderKL.from_config(folder.vae)))]
+        vae = [] if tiny else [_built(folder.path / "vae", lambda: AutoencoderKL.from_config(folder.vae))]
 
     def size(module: nn.Module) -> int:
         return sum(p.numel() for p in module.parameters()) * dtype.itemsize
 
-    need = sum(map(size, vae)) + (max if offload else sum)(map(size, visitors))
+    need = sum(map(size, cast(list[nn.Module], vae))) + (max if offload else sum)(map(size, visitors))
     free = free_memory(device)
     if need > free:
         raise PriorError(
