@@ -21,12 +21,15 @@ THREADS = max(1, (os.cpu_count() or 1) // WORKERS)
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # read by torch when it is imported, and by child processes
     os.environ.setdefault(_name, str(THREADS))
 os.environ.setdefault("NUMBA_NUM_THREADS", str(max(2, THREADS)))  # two: tests show that their number changes no bit
+os.environ.setdefault("GOMP_SPINCOUNT", "50000")  # as the launcher has it, but before torch is imported
 
+import numba  # noqa: E402
 import torch  # noqa: E402
 
 from tests import shapes  # noqa: E402
 
 shapes.install()
+numba.set_num_threads(min(THREADS, numba.config.NUMBA_NUM_THREADS))
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = ["data.width=24", "data.height=24", "system.report.video_frames=0", "trainer.accelerator=cpu"]
