@@ -325,14 +325,17 @@ def preview(system: Any, data: Any, trainer: Any) -> None:
 
 
 def snapshot(config: Any, merged: Any, source: str) -> None:
-    """Leave in the trial's folder what made it: the config as parsed and as written, and the commands."""
-    from dreamcatalyst.config import save_config
+    """Leave in the trial's folder what made it: the config as parsed and as written (an overlay whole: its base is
+    named from where it lies), and the commands."""
+    from dreamcatalyst.config import merge_open, save_config
     from dreamcatalyst.files import write_bytes, write_text
+    from omegaconf import OmegaConf
 
     folder = Path(config.trial_dir)
     raw, commands = folder / "configs" / "raw.yaml", folder / "cmd.txt"
     if not raw.exists() or not raw.samefile(source):
-        write_bytes(raw, Path(source).read_bytes())
+        overlay = "base" in OmegaConf.load(source)
+        write_bytes(raw, OmegaConf.to_yaml(merge_open(source)).encode() if overlay else Path(source).read_bytes())
     save_config(config, folder / "configs" / "parsed.yaml", merged)
     before = commands.read_text(encoding="utf-8") if commands.exists() else ""
     write_text(commands, f"{before}{shlex.join(['python', *sys.argv])}\n")

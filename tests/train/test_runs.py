@@ -2,11 +2,13 @@
 
 import csv
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+import yaml
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.errors import ConfigError
 from dreamcatalyst.report import results
@@ -260,3 +262,12 @@ def test_an_edit_finer_than_its_fit_is_refused_with_the_remedy(launch, capsys):
         assert Fitted.of(same / "save" / name) == Fitted.of(fit / "save" / "last.ply")
     finer = ["data.width=48", "data.height=48", "system.allow_coarse_fit=true"]
     launch("closed-form.yaml", *edit, *finer, name="allowed")
+
+
+def test_an_overlay_is_kept_whole_and_runs_again_from_where_it_is_kept(launch, tmp_path):
+    overlay, base = tmp_path / "over.yaml", Path(__file__).resolve().parents[2] / "configs/closed-form.yaml"
+    overlay.write_text(f"base: {base}\nsystem: {{guidance: {{chi: 0.1}}}}\n")
+    trial = launch(str(overlay), "trainer.max_steps=1")
+    kept = trial / "configs" / "raw.yaml"
+    assert "base" not in yaml.safe_load(kept.read_text()) and "chi: 0.1" in kept.read_text()
+    assert_same_splats(launch(str(kept), "trainer.max_steps=1"), trial)
