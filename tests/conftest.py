@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ THREADS = max(1, (os.cpu_count() or 1) // WORKERS)
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # read by torch when it is imported, and by child processes
     os.environ.setdefault(_name, str(THREADS))
 os.environ.setdefault("NUMBA_NUM_THREADS", str(max(2, THREADS)))  # two: tests show that their number changes no bit
+_kept = tempfile.TemporaryDirectory(prefix="kept-")  # what is kept between runs: never the user's own
+os.environ["DREAMCATALYST_CACHE"] = _kept.name
 os.environ.setdefault("GOMP_SPINCOUNT", "50000")  # as the launcher has it, but before torch is imported
 
 import numba  # noqa: E402

@@ -15,6 +15,7 @@ from ..config import AtLeastOne, NonNegative, PositiveFraction, parse
 from ..data.camera import Cameras
 from ..errors import ConfigError, choose
 from ..guidance.guidance import Guidance
+from ..kept import digest
 from ..registry import Registry
 from ..render.lift import Evidence, lift, vote
 from ..scene import mask as masks
@@ -128,7 +129,7 @@ def make_mask(config: MaskConfig, request: MaskRequest, folder: Path | None = No
     if segmenter is None:
         return None
     folder = Path(config.cache).expanduser() if config.cache else folder
-    key = cache.digest(cache.code(), *_made_of(config, segmenter, request)) if folder else ""
+    key = digest(cache.code(), *_made_of(config, segmenter, request)) if folder else ""
     found = cache.load(folder, key, len(request.scene)) if folder else None
     if found is None:
         found = _find(config, segmenter, request)

@@ -22,8 +22,8 @@ from ..diffusion.api import Row
 from ..diffusion.noise import abar_at, add_noise, keyed_noise
 from ..errors import ConfigError, PriorError, choose
 from ..guidance.guidance import Guidance
+from ..kept import stamp
 from .api import MaskRequest, Segmenter
-from .cache import stamp
 
 NOTHING = 3.7  # times what two noise draws differ by, below which a difference of predictions is none of the edit's
 DECIDING = 6  # views that are asked first, and twice, whether the edit is one of everything

@@ -16,8 +16,8 @@ from torch import Tensor
 from ..config import Between
 from ..diffusion.folder import find_folder, load, not_given
 from ..errors import ConfigError, PriorError, SceneError
+from ..kept import stamp
 from .api import MaskRequest, Segmenter
-from .cache import stamp
 
 CLIPSEG, DINO, SAM = "clipseg", "grounding-dino", "sam"  # as the models' config.json calls them
 EXAMPLES = {
