@@ -27,13 +27,14 @@ HOSTED = [path for path in CONFIGS if path.startswith("configs/swap/")]  # for t
 
 # The way the data goes: a file imports only from its own place and from what stands to the left of it.
 ORDER = ["config", "data", "scene", "render", "demo", "diffusion", "guidance", "segment", "loss", "report", "train"]
-FOR_ALL = {"cache", "errors", "kept", "memory", "files", "registry", "plugin"}
+FOR_ALL = {"cache", "errors", "kept", "memory", "meter", "files", "registry", "plugin"}
 RUNS = {"resume", "signals"}  # what is about whole runs, and so for the folder that assembles them
 OUTSIDE = {  # files of the top level that stand outside the order, and what each may import
     "__init__": {"plugin"},
     "cache": set(),
     "kept": set(),
     "memory": set(),
+    "meter": set(),
     "errors": set(),
     "files": {"errors"},
     "registry": {"errors"},

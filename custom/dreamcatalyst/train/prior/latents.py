@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ... import files, plugin
 from ...errors import FileError
-from ..progress import Meter
+from ...meter import Meter
 from .data import Pairs
 
 BATCH = 32
