@@ -8,10 +8,9 @@ from ..config import Count, Fraction, NonNegative
 from ..errors import ConfigError, choose
 from ..guidance.config import GuidanceConfig
 from ..loss.anchor import AnchorConfig
-from ..segment.api import MaskConfig
 from .density import DensifyConfig
-from .method import MethodParts
 from .preview import PreviewConfig
+from .sourced import SourcedParts
 
 REGIONS = ("current", "start", "everywhere")
 
@@ -57,13 +56,12 @@ class EditDensifyConfig(DensifyConfig):
 
 
 @dataclass(frozen=True)
-class EditParts(MethodParts):
+class EditParts(SourcedParts):
     """The parsed sections of an edit."""
 
     guidance: GuidanceConfig
     prompt_processor: PromptConfig
     preview: PreviewConfig
-    mask: MaskConfig
     densify: EditDensifyConfig
     anchor: AnchorConfig
     loss: LossConfig

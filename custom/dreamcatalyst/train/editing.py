@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,7 @@ import torch
 from torch import Tensor
 
 from .. import plugin
-from ..cache import ByteCache
-from ..data.camera import Cameras
-from ..data.truth import GroundTruth, normalised
+from ..data.truth import normalised
 from ..errors import ConfigError, PriorError, SceneError, choose, nearest
 from ..guidance.config import chosen_prior
 from ..guidance.guidance import Guidance
@@ -22,23 +19,17 @@ from ..loss.anchor import anchor_loss, anchor_step
 from ..loss.perceptual import Lpips
 from ..render.api import Render
 from ..report.clock import Clock
-from ..report.metrics import psnr
 from ..report.pictures import write_png
-from ..report.run import Panels
-from ..scene.fitted import Fitted
 from ..scene.gaussians import Gaussians
-from ..scene.ply import read_splats, write_ply
+from ..scene.ply import read_splats
 from ..scene.trainable import Splats
 from ..segment.api import MaskRequest
 from .edit_config import EditParts
 from .finite import require_finite
-from .method import Method
 from .plan import PlanBuilder, scene_bytes
 from .preview import preview_sheet
-from .region import EditRegion, dilate, restrict_to_mask
-from .source import SourceViews
-
-PHOTO_WARNING_DB = 15.0  # below it a source render and its photograph have hardly anything in common
+from .region import dilate, restrict_to_mask
+from .sourced import SourcedMethod
 
 
 def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> None:
@@ -51,33 +42,24 @@ def warn_of_unknown(taught: Mapping[str, Sequence[str]] | None, prompt: str) -> 
     )
 
 
-class EditMethod(Method):
+class EditMethod(SourcedMethod):
     """Edits the splats of gs_source (or those that the capture carries) as the instruction says.
 
-    guidance, source: the prior with its rule, and the scene before the edit; `prepare` loads them. perceptual: LPIPS,
-    where the loss has it. truth: what the edit should become, where that is known.
+    guidance: the prior with its rule; `prepare` loads it and the scene before the edit. perceptual: LPIPS, where the
+    loss has it.
     """
 
     part: EditParts
     guidance: Guidance
-    source: SourceViews
 
     def __init__(self, cfg: Any, part: EditParts, clock: Clock):
         super().__init__(cfg, part, clock)
         if cfg.mode:
             choose("mode", cfg.mode, cfg.steps, "system.mode")
-        chosen_prior(part.guidance)  # what the kinds of prior and mask take is looked at before any is made
-        part.mask.segmenter()
-        self.truth: GroundTruth | None = None
+        chosen_prior(part.guidance)  # what the kind of prior takes is looked at before any is made
         self.perceptual: Lpips | None = None
         self.generations = part.anchor.generations()
-        self._references = ByteCache(self._cache_bytes)
-        self._regions: dict[int, Tensor | None] = {}
         self._prepared = False
-
-    @property
-    def _cache_bytes(self) -> int:
-        return self.cfg.source_cache_mib * 2**20
 
     @property
     def title(self) -> str:
@@ -101,11 +83,12 @@ class EditMethod(Method):
                     "with. Set it to 0, or use the rule in2n."
                 )
             self.perceptual = Lpips(losses.perceptual_weights, device, "system.loss.perceptual_weights")
-        self.check_detail()
-        scene = self.given_scene() if not self.cfg.original else read_splats(self.cfg.original, origin=self.origin)
-        self.source = SourceViews(scene.to(device), self.draw, self.camera, lambda: self._splats, self._cache_bytes)
+        self.load_source()
         self._find_truth()
         self._prepared = True
+
+    def scene_before(self) -> Gaussians:
+        return self.given_scene() if not self.cfg.original else read_splats(self.cfg.original, origin=self.origin)
 
     def _find_truth(self) -> None:
         # Splats of one's own are another scene, and a prior that is exact has a truth of its own.
@@ -126,27 +109,6 @@ class EditMethod(Method):
             truth = self.truth
             prior.tell_truth(lambda index: truth.image(self.draw, self.camera(index)))
 
-    @cached_property
-    def fitted(self) -> Fitted | None:
-        return Fitted.of(self.cfg.gs_source) if self.cfg.gs_source else None
-
-    def check_detail(self) -> None:
-        """Refuse splats that were fitted to smaller pictures than the prior is to see: it would judge a blur."""
-        data = self.context.data
-        if self.fitted is None or not data.cfg.source or self.cfg.allow_coarse_fit:
-            return
-        capture = data.open(None, self.cfg.gs_source)
-        views = [capture.views[i] for i in capture.train]
-        times = self.fitted.too_coarse_for(views)
-        if times is not None:
-            fit, shown = self.fitted, Fitted.at(views)
-            side = math.ceil(max(fit.width, fit.height) * times)
-            raise ConfigError(
-                f"system.gs_source: '{self.cfg.gs_source}' was {fit.comment}, and this run draws it at {shown.width} x "
-                f"{shown.height}, focal length {shown.focal:.1f}: the prior would see it blurred. Fit it again with "
-                f"data.max_side={side} (configs/fit.yaml), or set system.allow_coarse_fit=true"
-            )
-
     def first_scene(self) -> Gaussians:
         return self.given_scene() if self.cfg.original else self.source.scene
 
@@ -166,49 +128,12 @@ class EditMethod(Method):
         return splats
 
     def mask_request(self, scene: Gaussians) -> MaskRequest:
-        """What a segmenter may know of the run."""
-        capture, renderer = self.context.data.open(scene, self.cfg.gs_source), self.part.renderer
-        return MaskRequest(
-            scene=scene,
-            cameras=[capture.cameras([i]) for i in range(len(capture.views))],
-            names=[view.name for view in capture.views],
-            views=capture.train,
-            extent=capture.extent,
-            render=lambda index: self.source.render(index).clamp(0, 1),
-            guidance=self.guidance,
-            prompt=self.part.prompt_processor.prompt,
-            backend=renderer.backend,
-            antialiased=renderer.antialiased,
-            background=renderer.background,
-            origin=self.origin,
-        )
+        prompt = self.part.prompt_processor.prompt
+        return replace(super().mask_request(scene), guidance=self.guidance, prompt=prompt)
 
-    def begin_at(self, scene: Gaussians, editable: Tensor) -> None:
-        """Remember what a masked edit began with: bool [N], which splats of `scene` may change."""
-        self.source.restrict(EditRegion(scene, editable, is_source=not self.cfg.original))
+    def begin_at(self, scene: Gaussians, editable: Tensor, is_source: bool = True) -> None:
+        super().begin_at(scene, editable, is_source and not self.cfg.original)
         self.guidance.forget_sources()
-
-    def begin_training(self) -> None:
-        comments = [] if self.fitted is None else [self.fitted.comment]
-        path, scene = self.context.save("source.ply"), self.source.scene.to("cpu")
-        write_ply(path, scene, origin=self.origin, comments=comments)
-        self.compare_with_photos()
-
-    def compare_with_photos(self) -> None:
-        """Warn where renders of the source have nothing to do with the photographs of the same cameras."""
-        capture = self.capture
-        if not capture.has_photos or (capture.scene is not None and not self.cfg.gs_source):  # then they are the same
-            return
-        some = capture.train[:: max(1, len(capture.train) // 4)][:4]
-        photos = [self.photo(i).cpu() for i in some]
-        values = [psnr(self.source.render(i)[None].cpu(), photo[None]) for i, photo in zip(some, photos, strict=True)]
-        mean = float(torch.cat(values).mean())
-        if mean < PHOTO_WARNING_DB:
-            plugin.warn(
-                f"the splats' renders and the photographs of {capture.source} differ by {mean:.1f} dB PSNR "
-                f"(under {PHOTO_WARNING_DB:.0f}): do these cameras and these splats belong together? "
-                "data.source= left empty puts cameras around the splats"
-            )
 
     # --- a step
 
@@ -261,14 +186,10 @@ class EditMethod(Method):
 
     # --- what it is compared with
 
-    @torch.no_grad()
-    def references(self, index: int) -> dict[str, Tensor]:
-        return self._references.get(index, lambda: self._make_references(index))
-
-    def _make_references(self, index: int) -> dict[str, Tensor]:
+    def make_references(self, index: int) -> dict[str, Tensor]:
         source = self.source.render(index)
         if self.truth is not None:
-            return {"truth": self.truth.image(self.draw, self.camera(index)), "source": source}
+            return super().make_references(index)
         known = self.guidance.known_edit(source, index)
         if known is None:
             return {"source": source}
@@ -276,28 +197,6 @@ class EditMethod(Method):
         if rest is None or torch.allclose(rest, known, atol=1e-3):  # a balanced prior rests at its edit
             return {"edit": known, "source": source}
         return {"edit": known, "fixed_point": rest, "source": source}
-
-    def region(self, index: int) -> Tensor | None:
-        """The thing itself where the truth is known, else what the mask lets change; None for an edit of everything."""
-        if self.truth is not None:
-            if index not in self._regions:
-                self._regions[index] = self.truth.region(self.draw, self.camera(index))
-            return self._regions[index]
-        share = self.source.view(index)[1]
-        return None if share is None else share.round()
-
-    def known_scenes(self) -> dict[str, Any]:
-        return {"source": self.source.scene, **({} if self.truth is None else {"truth": self.truth.scene})}
-
-    def panels(self, index: int) -> Panels:
-        source, references = self.source.render(index), self.references(index)
-        shown = [("source", source), (f"edited, step {self.context.step()}", self.picture(index))]
-        names = {"truth": "the truth", "edit": "the prior's edit"}
-        return [*shown, *((label, references[name]) for name, label in names.items() if name in references)]
-
-    def video_frame(self, cameras: Cameras) -> Panels:
-        edited = self.draw_now(cameras).rgb[0]
-        return [("source", self.draw(self.source.scene, cameras).rgb[0]), ("edited", edited)]
 
     def describe(self, plan: PlanBuilder) -> None:
         plan.prior(self.guidance, self.context.data.cfg.batch_size)
