@@ -7,24 +7,20 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import inspect
 import logging
 import os
 import shlex
 import signal
 import sys
 import traceback
-import warnings
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent
+FIT = ROOT / "configs" / "fit.yaml"  # how splats are fitted to photographs
 # Threads that wait soon sleep instead of spinning on (GNU OpenMP spins six times as long), unless the user says
 # otherwise: where something else wants the cores, spinning takes them from the very thread that is waited for.
 os.environ.setdefault("GOMP_SPINCOUNT", "50000")
-MINUTES = 3  # of training between two checkpoints, where checkpoint.minutes says nothing else
-SINGLE = ("auto", "single_device")  # strategies of one process
 
 
 def arguments(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
@@ -111,6 +107,7 @@ def run(args: argparse.Namespace, overrides: list[str], stop: Any) -> int:
     """Load the config, build data and system, and hand them to Lightning. stop: the Stop that takes the signals."""
     from dreamcatalyst.config import merge_config, merge_open, read_config
     from dreamcatalyst.imports import import_parts
+    from dreamcatalyst.trainer import keys_below
 
     if args.gpu is not None:
         os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(args.gpu))  # read by torch, which is not imported yet
@@ -143,27 +140,36 @@ def carry_out(args: argparse.Namespace, config: Any, merged: Any, mode: str, sto
     from dreamcatalyst.errors import ConfigError
     from dreamcatalyst.resume import compare, contents, read_checkpoint, recipe
     from dreamcatalyst.runs import told
+    from dreamcatalyst.train.first_fit import FirstFit
     from dreamcatalyst.train.keeper import Checkpoints, Keeper
-    from dreamcatalyst.train.progress import AboveTheLine, Progress
-    from lightning.pytorch.utilities.exceptions import MisconfigurationException
+    from dreamcatalyst.train.progress import Progress
+    from dreamcatalyst.trainer import checkpoint_minutes, make_trainer, misconfiguration, quiet
 
     if not args.verbose:
         quiet()
     progress = Progress()
-    log = logging.getLogger("dreamcatalyst")
-    log.handlers = [AboveTheLine(progress)]
-    log.setLevel(logging.DEBUG if args.verbose else logging.INFO)
+    log = listen(progress, args.verbose)
 
     minutes, training = checkpoint_minutes(config), mode == "train"
     parts = classes(config)
+    first = FirstFit.of(config, parts, FIT)
+    if first is not None:  # as if it had been given
+        config.system["gs_source"] = str(first.result)
     made_by = recipe(config, parts)
     saved = read_checkpoint(config.resume, to_train=training) if config.resume else None
     if saved and training:
         compare(saved, made_by, config.resume)
-    checkpoints = Checkpoints({"recipe": made_by, "contents": contents(made_by) if training else {}})
+    checkpoints = Checkpoints({"recipe": made_by})
     keeper = Keeper(stop, checkpoints, Path(config.trial_dir) / "ckpts", minutes)
     trainer = make_trainer(config, [progress, keeper], checkpoints, training)
-    data, system = build(config, parts)
+    data, system = build(config, parts, first.data if first else None)
+    if first is not None:
+        if not first.done:
+            system.to(trainer.strategy.root_device).look_ahead(data)
+            fit_first(first, args, stop)
+            listen(progress, args.verbose)
+        log.info(first.text)
+    checkpoints.made_by["contents"] = contents(made_by) if training else {}
     log.info(f"{mode}: {config.trial_dir}")
     try:
         if training:
@@ -182,12 +188,41 @@ def carry_out(args: argparse.Namespace, config: Any, merged: Any, mode: str, sto
             stage = {"validate": trainer.validate, "test": trainer.test, "export": trainer.predict}[mode]
             table = {} if mode == "export" else {"verbose": args.verbose}  # Lightning's own table of scores
             stage(system, datamodule=data, ckpt_path=config.resume, **table)
-    except MisconfigurationException as error:  # an option that this system's kind of training cannot have
+    except misconfiguration() as error:  # an option that this system's kind of training cannot have
         raise ConfigError(f"trainer: {error}") from error
     except Exception:
         if keeper.began is not None:
             log.info(f"stopped by an error; {told(Path(config.trial_dir))}")
         raise
+
+
+def fit_first(first: Any, args: argparse.Namespace, stop: Any) -> None:
+    """Carry out the fit that an edit begins with, or go on with it, or wait for the process that is at it."""
+    from dreamcatalyst import plugin
+    from dreamcatalyst.config import read_config
+    from dreamcatalyst.resume import read_checkpoint
+    from dreamcatalyst.runs import alone, claimed
+    from dreamcatalyst.signals import Stopped
+
+    with alone(first.folder, lambda: plugin.info("another process fits these photographs: waiting for it")):
+        if first.done:
+            return
+        first.clear()
+        mode = "train"
+        if first.checkpoint.is_file():
+            first.merged.resume = str(first.checkpoint)
+            done = read_checkpoint(first.checkpoint, to_train=False)["global_step"]
+            mode = "train" if done < first.steps else "test"
+            plugin.info(f"the fit to the photographs of {first.source} goes on from step {done:,} of {first.steps:,}")
+        else:
+            plugin.info(f"no system.gs_source: splats are fitted to the photographs of {first.source} first")
+        with claimed(read_config(first.merged), numbered=False, writes=True) as config:
+            try:
+                carry_out(argparse.Namespace(config=FIT, verbose=args.verbose), config, first.merged, mode, stop)
+            except Stopped:
+                plugin.info("the fit so far is kept: the same command goes on with it")
+                raise
+        first.finish()
 
 
 def classes(config: Any) -> dict[str, type]:
@@ -208,22 +243,18 @@ def classes(config: Any) -> dict[str, type]:
     return found
 
 
-def keys_below(merged: Any) -> list[str]:
-    """The dotted keys that the sections of a config take, whatever is wrong with it otherwise."""
-    from dreamcatalyst import plugin
-    from dreamcatalyst.config import known_keys
-    from lightning.pytorch import Trainer
-    from lightning.pytorch.callbacks import ModelCheckpoint
+def listen(progress: Any, verbose: bool) -> logging.Logger:
+    """What is logged, above the line of `progress`."""
+    from dreamcatalyst.train.progress import AboveTheLine
 
-    names = {section: merged.get(f"{section}_type") for section in ("data", "system")}
-    known = plugin.names()
-    found = [key for where, name in names.items() if name in known for key in known_keys(plugin.find(name), where)]
-    options = {"trainer": Trainer, "checkpoint": ModelCheckpoint}
-    return found + [f"{where}.{key}" for where, cls in options.items() for key in inspect.signature(cls).parameters]
+    log = logging.getLogger("dreamcatalyst")
+    log.handlers = [AboveTheLine(progress)]
+    log.setLevel(logging.DEBUG if verbose else logging.INFO)
+    return log
 
 
-def build(config: Any, parts: dict[str, type]) -> tuple[Any, Any]:
-    """The data module and the system. parts: their classes."""
+def build(config: Any, parts: dict[str, type], data: Any = None) -> tuple[Any, Any]:
+    """The data module, where it is not there already, and the system. parts: their classes."""
     from dreamcatalyst import plugin
     from dreamcatalyst.errors import ConfigError
 
@@ -231,87 +262,10 @@ def build(config: Any, parts: dict[str, type]) -> tuple[Any, Any]:
         plugin.pl.seed_everything(config.seed, workers=True)
     except ValueError as error:
         raise ConfigError(f"seed: {error}.") from error
-    data = parts["data"](config.data)
+    data = data or parts["data"](config.data)
     system = parts["system"](config.system, resumed=config.resume is not None)
     system.set_save_dir(str(Path(config.trial_dir) / "save"))
     return data, system
-
-
-def checkpoint_minutes(config: Any) -> float:
-    """Minutes of training between two checkpoints, 0 for none but those at the steps that the config names."""
-    from dreamcatalyst.errors import ConfigError
-
-    minutes = config.checkpoint.get("minutes", MINUTES)
-    if isinstance(minutes, bool) or not isinstance(minutes, (int, float)) or not 0 <= minutes < float("inf"):
-        raise ConfigError(f"checkpoint.minutes: got {minutes!r}, expected minutes between two checkpoints; 0: none.")
-    return minutes
-
-
-def make_trainer(config: Any, callbacks: list[Any], checkpoints: Any, training: bool) -> Any:
-    """Lightning's Trainer, on one GPU where there is one and else on the CPU; `trainer` in the YAML overrides.
-    checkpoints: the CheckpointIO."""
-    from dreamcatalyst.errors import ConfigError
-    from lightning.pytorch import Trainer
-    from lightning.pytorch.accelerators import CUDAAccelerator
-    from lightning.pytorch.callbacks import ModelCheckpoint
-    from lightning.pytorch.loggers import CSVLogger
-    from lightning.pytorch.utilities.exceptions import MisconfigurationException
-
-    options = {
-        "accelerator": "gpu" if CUDAAccelerator.is_available() else "cpu",
-        "devices": 1,
-        "inference_mode": False,
-        "logger": training,
-        "enable_model_summary": False,
-        "enable_checkpointing": training,
-        "default_root_dir": config.trial_dir,
-        **known_options(Trainer, config.trainer, "trainer"),
-    }
-    if not options.get("enable_progress_bar", True):
-        callbacks = callbacks[1:]
-    if training and options["logger"] is True:
-        options["logger"] = CSVLogger(config.trial_dir, name="csv_logs")
-    options["plugins"] = [*(options.get("plugins") or []), checkpoints]
-    if options.get("strategy", "auto") not in SINGLE:
-        raise ConfigError(f"trainer.strategy: got '{options['strategy']}', expected auto: a run is one process.")
-    ends = {"limit_train_batches": (None, 1.0), "overfit_batches": (None, 0, 0.0)}  # 1 is one batch, 1.0 is all of them
-    for name, whole in ends.items() if training else ():
-        if not any(options.get(name) == value and type(options.get(name)) is type(value) for value in whole):
-            raise ConfigError(f"trainer.{name}: leave it out: what ends a run is trainer.max_steps alone.")
-    interval = options.get("val_check_interval")
-    if isinstance(interval, (int, float)) and not interval > 0:
-        raise ConfigError(
-            f"trainer.val_check_interval: got {interval}, expected steps between two validations, over 0."
-        )
-    where = "trainer"  # the section that is to blame
-    try:
-        if training and options["enable_checkpointing"]:
-            checkpoint = known_options(ModelCheckpoint, config.checkpoint, "checkpoint", {"minutes"})
-            # Without a counter, last.ckpt is the last one in a resumed run too.
-            ours = {"dirpath": Path(config.trial_dir) / "ckpts", "enable_version_counter": False}
-            where = "checkpoint"
-            callbacks = [*callbacks, ModelCheckpoint(**ours | checkpoint)]
-            where = "trainer"
-        trainer = Trainer(callbacks=callbacks, **options)
-    except (MisconfigurationException, ValueError, TypeError, ImportError) as error:
-        raise ConfigError(f"{where}: {' '.join(str(error).split())}") from error
-    if trainer.world_size > 1:
-        raise ConfigError(f"trainer: asks for {trainer.world_size} processes, expected one: set trainer.devices=1.")
-    return trainer
-
-
-def known_options(cls: type, section: Any, where: str, ours: Collection[str] = ()) -> dict[str, Any]:
-    """A section of the YAML as keyword arguments for `cls`, without keys that are `ours`. Raises ConfigError for one
-    that it does not take."""
-    from dreamcatalyst.errors import ConfigError, unknown
-    from omegaconf import OmegaConf
-
-    known = [name for name in inspect.signature(cls).parameters if name not in ("callbacks", "kwargs")]
-    for key in section:
-        if key not in known and key not in ours:
-            raise ConfigError(unknown("key", key, {*known, *ours}, where))
-    plain: Any = OmegaConf.to_container(OmegaConf.create(section))
-    return {key: value for key, value in plain.items() if key not in ours}
 
 
 def preview(system: Any, data: Any, trainer: Any) -> None:
@@ -339,13 +293,6 @@ def snapshot(config: Any, merged: Any, source: str) -> None:
     save_config(config, folder / "configs" / "parsed.yaml", merged)
     before = commands.read_text(encoding="utf-8") if commands.exists() else ""
     write_text(commands, f"{before}{shlex.join(['python', *sys.argv])}\n")
-
-
-def quiet() -> None:
-    """Silence what Lightning, which must have been imported, says about itself and its user cannot act on."""
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.ERROR)
-    warnings.filterwarnings("ignore", module=r"lightning\.")
 
 
 def end_by_ctrl_c() -> None:

@@ -43,6 +43,7 @@ OUTSIDE = {  # files of the top level that stand outside the order, and what eac
     "runs": {"config", "errors", "files"},
     "resume": {"config", "errors", "files", "plugin"},
     "signals": set(),
+    "trainer": {"config", "errors", "plugin"},
     "link": {"errors"},
     "imports": {"errors"},
     "host": {"config", "diffusion", "errors", "guidance", "plugin"},

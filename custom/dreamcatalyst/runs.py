@@ -6,7 +6,7 @@ import dataclasses
 import errno
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -59,6 +59,26 @@ def claimed(config: ExperimentConfig, *, numbered: bool, writes: bool) -> Iterat
                 folder.rmdir()
 
 
+@contextmanager
+def alone(folder: Path, waits: Callable[[], None]) -> Iterator[None]:
+    """Inside the block no other process is inside one for the same folder, which is kept between runs and need not be
+    there: where one is, `waits` is called, and it is waited for. Raises ConfigError."""
+    path = folder.with_name(f"{folder.name}.lock")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise ConfigError(
+            f"{path.parent}: what is kept between runs cannot be written there: {error.strerror or error}. Choose "
+            "another folder: DREAMCATALYST_CACHE=<folder> before the command."
+        ) from error
+    try:
+        _lock(folder, handle, waits)
+        yield
+    finally:
+        os.close(handle)
+
+
 def _make_next(folder: Path) -> Path:
     for number in itertools.count(1):
         path = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
@@ -68,8 +88,9 @@ def _make_next(folder: Path) -> Path:
     raise RuntimeError("unreachable")
 
 
-def _lock(folder: Path, handle: int) -> None:
-    """A lock on the folder itself, which leaves no file behind and ends with the process, however that ends."""
+def _lock(folder: Path, handle: int, waits: Callable[[], None] | None = None) -> None:
+    """A lock on the folder itself, which leaves no file behind and ends with the process, however that ends. waits:
+    called before another process is waited for; None: that is an error."""
     try:
         import fcntl
     except ImportError:  # Windows has none, and two runs into one folder have to be the user's care there
@@ -78,6 +99,10 @@ def _lock(folder: Path, handle: int) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            if waits is not None:
+                waits()
+                fcntl.flock(handle, fcntl.LOCK_EX)
+                return
             raise ConfigError(
                 f"{folder}: another process is running in this folder. Wait for it, or choose another: tag=..."
             ) from error

@@ -141,6 +141,10 @@ class BaseSystem(LightningModule):
         """What the progress line shows of the last step, such as {"loss": 0.1, "splats": 20000}."""
         return {}
 
+    def cost(self, step: int) -> float:
+        """What a step costs, as a multiple of what others do; the time that is left is told by it."""
+        return 1.0
+
     def keep_result(self) -> None:
         """Write, after the last step, what would be missed most; the checkpoint comes after it."""
 

@@ -19,6 +19,7 @@ from .run import RunFacts
 from .scores import mean_scores
 
 PICTURES = 4  # views on the page
+FIT = "fit.json"  # in the folder of a fit that an edit began with: how that went
 LABELS = {  # of the tiles, the best first, by score
     "psnr_truth_inside": "PSNR to the truth, where it is edited, dB",
     "psnr_truth": "PSNR to the truth, dB",
@@ -49,6 +50,13 @@ def plain(values: Mapping[str, float]) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
+def fit_before(run: RunFacts) -> dict:
+    """How the fit went that made the splats with which the run began (steps, seconds, scores), where it was made for
+    such runs; else empty."""
+    path = Path(str(run.settings.get("gs_source") or "")).parent.parent / FIT
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
 def write_report(run: RunFacts, record: Record, scores: Mapping[int, Mapping[str, float]]) -> list[Path]:
     """Write error.csv and error.svg (where there was training), index.html and summary.json; return their folder.
 
@@ -66,6 +74,7 @@ def write_report(run: RunFacts, record: Record, scores: Mapping[int, Mapping[str
         "seconds": round(seconds, 2),
         "splats": run.splats,
         "skipped": record.skipped,
+        **({"fit": fit} if (fit := fit_before(run)) else {}),
         "held_out": [run.capture.views[i].name for i in scores],
         "mean": plain(mean),
         "stages": {name: round(value, 3) for name, value in record.clock.stages.items()},
@@ -137,6 +146,9 @@ def make_page(run: RunFacts, record: Record, summary: Mapping, scores: Mapping[i
     tiles = {label: f"{mean[name]:.4g}" for name, label in tile_labels(mean).items()}
     tiles |= {"steps": f"{summary['step']:,}", "seconds in training": f"{summary['seconds']:,.1f}"}
     tiles |= {"splats": f"{summary['splats']:,}"} | ({"steps left out": f"{record.skipped}"} if record.skipped else {})
+    if fit := summary.get("fit"):
+        tiles |= {"seconds of the fit before": f"{fit['seconds']:,.1f}"}
+        tiles |= {"PSNR of that fit, dB": f"{fit['psnr_photo']:.4g}"} if fit.get("psnr_photo") is not None else {}
     shown = list(scores)[:: max(1, len(scores) // PICTURES)][:PICTURES]
     given = {
         name: "\n".join(f"{key}: {value}" for key, value in summary[name].items()) for name in ("machine", "versions")

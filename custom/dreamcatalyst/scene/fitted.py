@@ -48,6 +48,12 @@ class Fitted:
         return needed / self.focal if needed > TOLERANCE * self.focal else None
 
 
+def downscale_for(views: Sequence[View]) -> float:
+    """By how much the photographs of `views` may be made smaller for a fit that is as fine as the views are: 1 or
+    more."""
+    return max(1.0, median(map(_finest, views)) / Fitted.at(views).focal)
+
+
 def _finest(view: View) -> float:
     """The focal length of a view's photograph as it was taken, pixels; without one, of the view."""
     enlarged = view.photo.window[2] / view.photo.width if view.photo is not None else 1.0

@@ -31,9 +31,14 @@ class EditSystem(SplatSystem):
         allow_coarse_fit: bool = False  # edit splats that were fitted to smaller pictures than those of this run
         mask: dict = field(default_factory=dict)  # where the edit may take place
         anchor: dict = field(default_factory=dict)  # what splats are held to, by generation
+        first_fit: dict = field(default_factory=dict)  # the fit on the way, where there is no gs_source
         source_cache_mib: Count = 1024  # what is kept of renders of the source
 
     method: EditMethod
+
+    def look_ahead(self, data: Any) -> None:
+        super().look_ahead(data)
+        self.method.load_prior()
 
     def preview(self, data: Any) -> list[Path]:
         """Write what the prior itself makes of one view, without a run."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..config import Count, Fraction, NonNegative
 from ..errors import ConfigError, choose
@@ -56,6 +56,16 @@ class EditDensifyConfig(DensifyConfig):
 
 
 @dataclass(frozen=True)
+class FirstFitConfig:
+    """The fit with which an edit of photographs begins where no gs_source is given: a run of configs/fit.yaml at the
+    size at which the edit draws. Only our own launcher makes one."""
+
+    steps: Count = 3000  # 0: none, splats must be given
+    data: dict = field(default_factory=dict)  # keys of that YAML's `data` and `system`, with other values
+    system: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class EditParts(SourcedParts):
     """The parsed sections of an edit."""
 
@@ -65,3 +75,4 @@ class EditParts(SourcedParts):
     densify: EditDensifyConfig
     anchor: AnchorConfig
     loss: LossConfig
+    first_fit: FirstFitConfig

@@ -59,7 +59,7 @@ class EditMethod(SourcedMethod):
         chosen_prior(part.guidance)  # what the kind of prior takes is looked at before any is made
         self.perceptual: Lpips | None = None
         self.generations = part.anchor.generations()
-        self._prepared = False
+        self._loaded = self._prepared = False
 
     @property
     def title(self) -> str:
@@ -67,11 +67,8 @@ class EditMethod(SourcedMethod):
 
     # --- a scene to begin with
 
-    def prepare(self) -> None:
-        """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""
-        super().prepare()
-        if self._prepared:
-            return
+    def load_prior(self) -> None:
+        """Load the prior and what else knows nothing of the scene. Raises PriorError and ConfigError."""
         device, words, losses = self.context.device, self.part.prompt_processor, self.part.loss
         self.guidance = Guidance(self.part.guidance, words.prompt, words.source_prompt, device=device)
         self.guidance.stage = self.clock.stage
@@ -83,6 +80,15 @@ class EditMethod(SourcedMethod):
                     "with. Set it to 0, or use the rule in2n."
                 )
             self.perceptual = Lpips(losses.perceptual_weights, device, "system.loss.perceptual_weights")
+        self._loaded = True
+
+    def prepare(self) -> None:
+        """Load the prior and then the source scene, so that a prior or a prompt that will not do is found first."""
+        super().prepare()
+        if self._prepared:
+            return
+        if not self._loaded:
+            self.load_prior()
         self.load_source()
         self._find_truth()
         self._prepared = True

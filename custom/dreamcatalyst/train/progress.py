@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
+from collections.abc import Callable
 from typing import Any
 
 from .. import plugin
-from ..meter import Meter
+from ..meter import Meter, duration
+
+FORECAST = 5.0  # seconds of training after which it is said how long a run will take
+LONG = 20.0  # seconds from which on that is worth a line
 
 
 class Progress(plugin.pl.callbacks.ProgressBar):
@@ -16,6 +21,8 @@ class Progress(plugin.pl.callbacks.ProgressBar):
     def __init__(self) -> None:
         super().__init__()
         self.meters: list[Meter] = []  # the innermost is last: validation interrupts training
+        self._first: tuple[float, int] | None = None  # seconds and step when the first step, which compiles, was done
+        self._told = False
 
     def disable(self) -> None:
         """Lightning calls this on all processes but the first; there is only one."""
@@ -26,6 +33,21 @@ class Progress(plugin.pl.callbacks.ProgressBar):
 
     def on_train_batch_end(self, trainer: Any, pl_module: Any, *batch: Any) -> None:
         self.meters[-1].update(trainer.global_step, pl_module.progress_metrics)
+        if self.meters[-1].total and not self._told:
+            self._forecast(trainer.global_step, self.meters[-1].total, pl_module.cost)
+
+    def _forecast(self, step: int, total: int, cost: Callable[[int], float]) -> None:
+        """Say how long the run will take, once the first steps have told."""
+        now = time.monotonic()
+        if self._first is None:
+            self._first = now, step
+        then, first = self._first
+        if now - then < FORECAST:
+            return
+        self._told = True
+        left = (now - then) / sum(map(cost, range(first, step))) * sum(map(cost, range(step, total)))
+        if left > LONG:
+            plugin.info(f"about {duration(left)} for the {total - step:,} steps to come, by those so far")
 
     def on_validation_start(self, trainer: Any, pl_module: Any) -> None:
         self.meters.append(Meter("validate", sum(trainer.num_val_batches), "view", passing=bool(self.meters)))

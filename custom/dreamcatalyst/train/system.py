@@ -43,6 +43,11 @@ class SplatSystem(MeasuredSystem):
             data, device, lambda: self.true_global_step, lambda: self.max_steps, self.save_path, self.resumed
         )
 
+    def look_ahead(self, data: Any) -> None:
+        """Find what will not do, such as words that a prior does not know, while the long work before a run (a fit to
+        photographs) is not begun. Raises what `setup` would."""
+        self.enter(data, self.device)
+
     def setup(self, stage: str) -> None:
         self.enter(self.trainer.datamodule, self.trainer.strategy.root_device)
         self.method.begin()
