@@ -1,4 +1,4 @@
-"""At what size splats were fitted: a comment in the header of their PLY, which other programs pass over."""
+"""At what size splats were fitted: a comment in their file (the header of a PLY), which other programs pass over."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 
 from ..data.views import View
-from .plyfile import read_comments
+from .formats.api import read_comments
 
 COMMENT = re.compile(r"fitted at (\d+) x (\d+) pixels, focal length (\d+(?:\.\d+)?)")
 TOLERANCE = 1.05  # of the focal length: sizes are rounded to whole pixels
@@ -32,13 +32,13 @@ class Fitted:
 
     @classmethod
     def of(cls, path: str | Path) -> Fitted | None:
-        """What the PLY at `path` says; None where it says nothing. Raises SceneError where it is no PLY."""
-        found = next(filter(None, map(COMMENT.fullmatch, read_comments(Path(path)))), None)
+        """What the splat file at `path` says; None where it says nothing. Raises SceneError where it is none."""
+        found = next(filter(None, map(COMMENT.fullmatch, read_comments(path))), None)
         return None if found is None else cls(int(found[1]), int(found[2]), float(found[3]))
 
     @property
     def comment(self) -> str:
-        """For the header of a PLY."""
+        """For a splat file."""
         return f"fitted at {self.width} x {self.height} pixels, focal length {self.focal:.1f}"
 
     def too_coarse_for(self, views: Sequence[View]) -> float | None:

@@ -17,11 +17,11 @@ from torch import Tensor
 from ..data.origin import ZERO, Origin, far_origin
 from ..errors import SceneError
 from ..files import replacing
+from .finite import finite
 from .gaussians import SH_C0, Gaussians
 from .plyfile import PlyTable, read_vertices, write_vertices
 
 MEANS, NORMALS, DC = ["x", "y", "z"], ["nx", "ny", "nz"], ["f_dc_0", "f_dc_1", "f_dc_2"]
-FARTHEST, LARGEST_LOG = 1e15, 40.0  # world units; beyond, float32 does not hold the squares
 SCALES, QUATS, RGB = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)], ["red", "green", "blue"]
 
 
@@ -36,7 +36,11 @@ def read_ply(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin =
     Raises SceneError: no such file, not a PLY, truncated, no splats in it (a mesh, a point cloud, compressed
     splats), a missing property, no rows, rows that are not finite.
     """
-    path = Path(path)
+    return finite(Path(path), read_rows(Path(path), origin), drop_nonfinite)
+
+
+def read_rows(path: Path, origin: Origin = ZERO) -> Gaussians:
+    """`read_ply` of all rows, also those that are not finite."""
     table = read_vertices(path)
     rest = _rest_names(path, table)
     colors = RGB if "f_dc_0" not in table.columns and set(RGB) <= set(table.columns) else DC
@@ -52,7 +56,7 @@ def read_ply(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin =
     extra = {name: _tensor(table.columns[name]) for name in table.columns if name not in used}
     if all(not extra[name].any() for name in NORMALS if name in extra):
         extra = {name: value for name, value in extra.items() if name not in NORMALS}
-    scene = Gaussians(
+    return Gaussians(
         means=torch.from_numpy(table.matrix(MEANS) if origin == ZERO else _positions(table, origin)),
         quats=torch.from_numpy(table.matrix(QUATS)),
         log_scales=torch.from_numpy(table.matrix(SCALES)),
@@ -61,19 +65,6 @@ def read_ply(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin =
         shN=shN.transpose(1, 2).contiguous(),
         extra=extra,
     )
-    return _finite(path, scene, drop_nonfinite)
-
-
-def read_splats(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin = ZERO) -> Gaussians:
-    """`read_ply` of splats that are to be drawn: also without positions and scales whose squares float32 does not hold,
-    as they come of files whose scale_* are no logarithms. Raises SceneError, or leaves such splats out."""
-    path = Path(path)
-    scene = read_ply(path, drop_nonfinite=drop_nonfinite, origin=origin)
-    far = (scene.means.double() + torch.tensor(origin, dtype=torch.float64)).abs() > FARTHEST
-    scene = _without(path, scene, far.any(dim=1), f"positions beyond {FARTHEST:g}", drop_nonfinite)
-    large = (scene.log_scales > LARGEST_LOG).any(dim=1)
-    fault = f"scales beyond exp({LARGEST_LOG:g}), though scale_* are logarithms,"
-    return _without(path, scene, large, fault, drop_nonfinite)
 
 
 def write_ply(path: str | Path, scene: Gaussians, *, origin: Origin = ZERO, comments: Sequence[str] = ()) -> Path:
@@ -170,30 +161,6 @@ def _brief(table: PlyTable) -> str:
         runs.setdefault(name.rstrip("0123456789"), []).append(name)
     shown = (names[0] if len(names) == 1 else f"{names[0]}..{names[-1]}" for names in runs.values())
     return ", ".join(shown) or "nothing"
-
-
-def _finite(path: Path, scene: Gaussians, drop: bool) -> Gaussians:
-    bad = torch.zeros(len(scene), dtype=torch.bool)
-    for _, value in scene.parameters():
-        bad |= ~value.flatten(1).isfinite().all(dim=1) if value.ndim > 1 else ~value.isfinite()
-    return _without(path, scene, bad, "NaN or infinite parameters", drop)
-
-
-def _without(path: Path, scene: Gaussians, bad: Tensor, fault: str, drop: bool) -> Gaussians:
-    """The scene without the splats `bad` [N] bool; raises SceneError where they are not to be dropped."""
-    count = int(bad.sum())
-    if count == 0:
-        return scene
-    if not drop:
-        first = int(bad.nonzero()[0, 0])
-        raise SceneError(
-            f"{path}: {count} of {len(scene)} splats have {fault} (first: row {first}). "
-            "system.drop_nonfinite=true leaves them out"
-        )
-    if count == len(scene):
-        raise SceneError(f"{path}: all {count} splats have {fault}; nothing is left")
-    print(f"{path}: {count} of {len(scene)} splats with {fault} left out")
-    return scene[~bad]
 
 
 def _tensor(column: np.ndarray) -> Tensor:

@@ -82,6 +82,23 @@ def read_vertices(path: Path) -> PlyTable:
     return PlyTable(columns, vertex.count, {e.name: e.count for e in elements})
 
 
+def read_elements(path: Path) -> dict[str, np.ndarray]:
+    """All elements of a binary PLY without lists: name -> structured table [rows].
+
+    Raises SceneError as `read_vertices` does, and for text.
+    """
+    with _opened(path) as file:
+        order, elements, _ = _header(path, file)
+        if not order:
+            raise SceneError(f"{path}: is a PLY in text, expected a binary one for packed splats")
+        tables = {}
+        for element in elements:
+            dtype = element.dtype(path, order)
+            if dtype.itemsize:
+                tables[element.name] = _binary(path, file, element, dtype, 0)
+    return tables
+
+
 def read_comments(path: Path) -> list[str]:
     """The comments in the header of a PLY file. Raises SceneError as `read_vertices` does for a header."""
     with _opened(path) as file:
@@ -117,6 +134,19 @@ def write_vertices(
     with path.open("wb") as file:
         file.write(header.encode())
         file.write(table.view(np.uint8).data)  # `tofile` would not say why it cannot
+
+
+def write_elements(path: Path, tables: dict[str, np.ndarray], comments: Sequence[str] = ()) -> None:
+    """Write structured tables as elements, binary little endian."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    for name, table in tables.items():
+        lines.append(f"element {name} {len(table)}")
+        fields = (table.dtype.fields or {}).items()
+        lines += [f"property {NAMES[kind[0].str[1:]]} {column}" for column, kind in fields]
+    with path.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode())
+        for table in tables.values():
+            file.write(table.view(np.uint8).data)
 
 
 def _opened(path: Path) -> BinaryIO:

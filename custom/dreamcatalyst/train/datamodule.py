@@ -20,8 +20,8 @@ from ..data.origin import ZERO, Origin
 from ..data.sizes import DRAWN, require_memory
 from ..data.views import Capture, views_for_step
 from ..errors import ConfigError
+from ..scene.formats.api import splat_origin
 from ..scene.gaussians import Gaussians
-from ..scene.ply import ply_origin
 
 
 class StepViews(IterableDataset):
@@ -62,7 +62,7 @@ class SplatData(plugin.pl.LightningDataModule):
 
     def open(self, scene: Gaussians | None = None, splats: str = "") -> Capture:
         """The capture, read at the first call. Where there is no source: the cameras that 3DGS wrote beside the file
-        `splats` (a PLY), or else an orbit around `scene`. Raises ConfigError where a step would take more
+        `splats`, or else an orbit around `scene`. Raises ConfigError where a step would take more
         views than there are."""
         if self.capture is not None:
             return self.capture
@@ -96,7 +96,7 @@ class SplatData(plugin.pl.LightningDataModule):
 
     def origin(self, splats: str = "") -> Origin:
         """The point of the files' world that is (0,0,0) in this run, the same for cameras and splats: of the capture,
-        or where there is none, of the PLY `splats`, which is read once."""
+        or where there is none, of the file `splats`, which is read once."""
         if splats not in self._origins:
             self._origins[splats] = self._find_origin(splats)
         return self._origins[splats]
@@ -106,7 +106,7 @@ class SplatData(plugin.pl.LightningDataModule):
             return ZERO
         if self.cfg.source or cameras_beside(Path(splats)) is not None:
             return self.open(None, splats).origin
-        return ply_origin(splats)
+        return splat_origin(splats)
 
     @property
     def held_out(self) -> list[int]:

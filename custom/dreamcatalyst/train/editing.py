@@ -20,8 +20,8 @@ from ..loss.perceptual import Lpips
 from ..render.api import Render
 from ..report.clock import Clock
 from ..report.pictures import write_png
+from ..scene.formats.api import read_splats
 from ..scene.gaussians import Gaussians
-from ..scene.ply import read_splats
 from ..scene.trainable import Splats
 from ..segment.api import MaskRequest
 from .edit_config import EditParts

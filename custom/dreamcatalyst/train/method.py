@@ -20,9 +20,9 @@ from ..render.api import Backend, Frozen, Render
 from ..report.clock import Clock
 from ..report.run import Panels, ReportConfig
 from ..scene.fitted import Fitted
+from ..scene.formats.api import read_splats
 from ..scene.gaussians import Gaussians
 from ..scene.generations import Generations
-from ..scene.ply import read_splats
 from ..scene.trainable import Splats
 from .datamodule import SplatData
 from .density import DensifyConfig
@@ -159,7 +159,7 @@ class Method:
             if capture.scene is not None:
                 return capture.scene
         raise ConfigError(
-            "system.gs_source: no splats are given. Name a PLY; configs/fit.yaml makes one from photographs."
+            "system.gs_source: no splats are given. Name a splat file; configs/fit.yaml makes one from photographs."
         )
 
     def plan(self) -> Plan:
