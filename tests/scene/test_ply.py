@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 from dreamcatalyst.errors import FileError, SceneError
+from dreamcatalyst.scene.formats.api import read_splats
 from dreamcatalyst.scene.gaussians import SH_C0, Gaussians
-from dreamcatalyst.scene.ply import read_ply, read_splats, write_ply
+from dreamcatalyst.scene.ply import read_ply, write_ply
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
