@@ -66,7 +66,7 @@ def values_of(config: str, overrides: list[str]) -> dict[str, Any]:
 
 def demo_bench(args: argparse.Namespace) -> Bench | str:
     """The edits of a made world with the small prior; in words, why not."""
-    from dreamcatalyst.diffusion.folder import SHIPPED, SHIPPED_NAME
+    from dreamcatalyst.diffusion.hub import SHIPPED, SHIPPED_NAME
 
     given = [*ALIKE, *([f"system.guidance.prior.path={Path(args.prior).resolve()}"] if args.prior else [])]
     config = str(Path(args.config).resolve())

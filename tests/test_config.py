@@ -521,3 +521,12 @@ def test_bases_that_cannot_be_are_refused(tmp_path):
     second.write_text("base: first.yaml\n")
     with pytest.raises(ConfigError, match=r"second.yaml: base: leads back .*first.yaml over .*second.yaml"):
         load_config(first)
+
+
+def test_a_choice_that_is_not_in_its_list_is_to_blame_and_not_what_follows_from_it(written):
+    path = written(
+        "trainer: {max_steps: '${system.steps.${system.mode}}'}\nsystem: {mode: fast, steps: {fast: 3, slow: 5}}"
+    )
+    assert load_config(path, cli_args=["tag=a", "system.mode=slow"]).trainer["max_steps"] == 5
+    with pytest.raises(ConfigError, match=r"system\.mode: unknown value 'fsat'\. Did you mean 'fast'\?"):
+        load_config(path, cli_args=["tag=a", "system.mode=fsat"])

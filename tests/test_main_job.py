@@ -12,7 +12,7 @@ import yaml
 from dreamcatalyst.config import parse
 from dreamcatalyst.demo.edits import EDITS, NOTHING
 from dreamcatalyst.demo.worlds import make_world
-from dreamcatalyst.diffusion.folder import SHIPPED, SHIPPED_NAME
+from dreamcatalyst.diffusion.hub import SHIPPED, SHIPPED_NAME
 from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig
 from dreamcatalyst.guidance.config import GuidanceConfig
 from dreamcatalyst.guidance.guidance import Guidance

@@ -57,7 +57,7 @@ class Runner:
 
     def _content(self, path: str | None) -> str | None:
         """A digest of a file, or of the weights in a folder; the name itself of what is not here."""
-        from dreamcatalyst.diffusion.folder import SHIPPED, SHIPPED_NAME
+        from dreamcatalyst.diffusion.hub import SHIPPED, SHIPPED_NAME
 
         place = SHIPPED if path == SHIPPED_NAME else Path(path or "")
         if not path or not place.exists():

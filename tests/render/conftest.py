@@ -5,7 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 from dreamcatalyst.data.camera import Cameras
+from dreamcatalyst.render.api import BACKENDS
 from dreamcatalyst.scene.gaussians import Gaussians
+
+CPU = torch.device("cpu")
+# The best precision in which each backend draws on this machine, for those that do.
+PRECISIONS = {
+    backend.name: dtype
+    for backend in BACKENDS.parts()
+    for dtype in (torch.float32, torch.float64)
+    if backend.takes(CPU, dtype)
+}
 
 
 @pytest.fixture

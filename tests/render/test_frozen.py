@@ -11,6 +11,8 @@ from dreamcatalyst.render.api import BACKENDS, Frozen, rasterize
 from dreamcatalyst.render.cpu import frozen as cpu_frozen
 from dreamcatalyst.scene.gaussians import PARAMETERS, Gaussians
 
+from tests.render.conftest import PRECISIONS
+
 TOTAL = 160
 
 
@@ -222,7 +224,7 @@ def test_one_view_is_kept_once_and_any_other_anew(random_scene, pinhole):
 
 def test_no_gradient_is_no_obstacle(random_scene, pinhole):
     frozen, scene = parts(random_scene, "among")
-    for backend in "cpu", "reference":
+    for backend in PRECISIONS:
         render = rasterize(scene, pinhole(8, 8), frozen=Frozen(frozen), backend=backend)
         assert not render.rgb.requires_grad and render.means2d.shape == (1, len(scene), 2)
 
@@ -230,7 +232,7 @@ def test_no_gradient_is_no_obstacle(random_scene, pinhole):
 def test_extras_do_not_matter(random_scene, pinhole):
     frozen, scene = parts(random_scene, "among")
     marked = frozen.with_extra(mask=torch.ones(len(frozen)))
-    for backend in "cpu", "reference":
+    for backend in PRECISIONS:
         a, b = (rasterize(scene, pinhole(8, 8), frozen=Frozen(f), backend=backend).rgb for f in (frozen, marked))
         assert torch.equal(a, b)
 

@@ -16,12 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.stiff.splats import cloud, decided
+from tests.render.conftest import PRECISIONS
 
 few = settings(max_examples=8, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
 # Precision and tolerance, in units of 1 + the largest number. In float32 two ways to the same picture differ by
 # rounding, at most by some hundred units in the last place.
-BACKENDS = {"reference": (torch.float64, 1e-9), "cpu": (torch.float32, 3e-5)}
+TOLERANCES = {torch.float64: 1e-9, torch.float32: 3e-5}
+BACKENDS = {name: (dtype, TOLERANCES[dtype]) for name, dtype in PRECISIONS.items()}
 backends = pytest.mark.parametrize("backend", BACKENDS)
 
 

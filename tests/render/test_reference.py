@@ -14,7 +14,9 @@ from dreamcatalyst.render.projection import project, rotations
 from dreamcatalyst.scene.gaussians import Gaussians
 from scipy.special import sph_harm_y
 
-BACKENDS = ["reference", "cpu"]
+from tests.render.conftest import PRECISIONS
+
+BACKENDS = list(PRECISIONS)
 FOCAL, SIDE = 50.0, 21  # the principal point is the centre of pixel (10, 10)
 
 

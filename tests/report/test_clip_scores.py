@@ -72,7 +72,7 @@ def test_the_predictor_is_its_layers_one_after_the_other(tmp_path):
 def test_what_does_not_fit_is_said_before_weights_are_read(folder, tmp_path):
     with pytest.raises(PriorError, match="no such folder"):
         Clip("./nowhere")
-    with pytest.raises(PriorError, match="'clipseg', expected a 'clip'"):
+    with pytest.raises(PriorError, match="'clipseg', expected clip"):
         Clip(str(make_clipseg(tmp_path / "other")))
     with pytest.raises(ConfigError, match="belong together"):
         ClipJudge(str(folder), "a photo of a fox", "", "")

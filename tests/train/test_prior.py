@@ -12,8 +12,8 @@ import pytest
 import torch
 from dreamcatalyst.config import parse
 from dreamcatalyst.demo.edits import EDITS
-from dreamcatalyst.diffusion.folder import SHIPPED
 from dreamcatalyst.diffusion.freeu import FreeU, FreeUConfig, freeu_sites
+from dreamcatalyst.diffusion.hub import SHIPPED
 from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig
 from dreamcatalyst.diffusion.noise import add_noise, stable_diffusion_schedule
 from dreamcatalyst.train.prior.folder import write_prior

@@ -41,6 +41,8 @@ def read_config(merged: DictConfig, below: Callable[[], Iterable[str]] = tuple) 
         reason = str(error).splitlines()[0]
         # What follows from a text is not to blame for what the text refers to.
         missing = re.search("Interpolation key '(.*)' not found", reason)
+        if missing:
+            _check_choices(missing[1], plain, merged)
         origin = [(k, t) for k, t in leaves(plain) if missing and f"${{{missing[1]}}}" in str(t)]
         place, text = origin[0] if origin else (place, text)
         raise ConfigError(f"{place}: {reason}, in {text}") from error
@@ -67,6 +69,17 @@ def _check_first(merged: DictConfig) -> None:
             f"trainer.max_steps: got {shown(steps)}, expected a whole number, 1 or more: schedules go over the run's "
             "length."
         )
+
+
+def _check_choices(missing: str, plain: dict, merged: DictConfig) -> None:
+    """Raise ConfigError where `missing` is what another key chooses from a list (system.steps.${system.mode}): then
+    that key's value is to blame."""
+    chosen = re.compile(r"\$\{([\w.-]+)\.\$\{([\w.-]+)\}\}")  # ${<list>.${<key>}}
+    for _, text in leaves(plain):
+        for among, key in chosen.findall(str(text)):
+            value, known = OmegaConf.select(merged, key), OmegaConf.select(merged, among)
+            if f"{among}.{value}" == missing and isinstance(known, DictConfig):
+                raise ConfigError(unknown("value", value, map(str, known), key))
 
 
 def _misplaced(key: str, plain: dict, below: Sequence[str]) -> list[str]:

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ..errors import PriorError
-from .folder import Folder, load
+from .folder import Folder
+from .hub import load
 
 
 class Autoencoder:

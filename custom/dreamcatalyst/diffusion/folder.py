@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from ..errors import PriorError
 from ..memory import free_memory
+from .hub import find_folder, first_line, load_processor, not_given
 
 T = TypeVar("T")
 
@@ -27,7 +28,6 @@ CONFIGS = {
     "tokenizer": "tokenizer_config.json",
     "scheduler": "scheduler_config.json",
 }
-SHIPPED_NAME, SHIPPED = "demo:prior", Path(__file__).resolve().parents[1] / "demo" / "prior"
 INSTRUCTIONS = "instructions.json"  # of a model that was taught a list of edits: name of the edit to its wordings
 PREDICTIONS = ("epsilon", "v_prediction", "sample")
 
@@ -103,31 +103,6 @@ def open_folder(path: str, conditioned: bool) -> Folder:
     return folder
 
 
-def find_folder(path: str, holds: str, example: str) -> Path | None:
-    """The local folder `path`, or None where it can be an id of the hub. Raises PriorError where it is neither.
-
-    holds: what belongs into the folder; example: an id; both for the message. "demo:prior" is the small model that lies
-    in this package.
-    """
-    folder = SHIPPED if path == SHIPPED_NAME else Path(path).expanduser()
-    if folder.is_dir():
-        return folder
-    if folder.is_absolute() or path.startswith((".", "~")) or len(folder.parts) != 2:
-        raise PriorError(
-            f"{path}: no such folder. Give a folder with {holds}, or a Hugging Face id such as '{example}'."
-        )
-    return None
-
-
-def not_given(path: str, error: Exception) -> str:
-    """The message for an id of the hub that could not be had."""
-    return (
-        f"{path}: no such folder here, not in the cache of Hugging Face, and the hub did not give it "
-        f"({type(error).__name__}). Where there is no network, run `hf download {path}` on a machine that has it, "
-        f"copy the folder, and give its path (or set HF_HOME to that cache)."
-    )
-
-
 def _local(path: str) -> Path:
     """The local folder of `path`, downloaded where it is an id of the hub that is not there yet."""
     folder = find_folder(path, ", ".join(CONFIGS), "timbrooks/instruct-pix2pix")
@@ -157,7 +132,7 @@ def _json(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise PriorError(f"{file}: not valid JSON ({_first_line(error)}). Download the folder again.") from error
+        raise PriorError(f"{file}: not valid JSON ({first_line(error)}). Download the folder again.") from error
     if not isinstance(content, dict):
         raise PriorError(f"{file}: holds a {type(content).__name__}, expected an object. Download the folder again.")
     return content
@@ -168,12 +143,7 @@ def _built(where: Path, build: Callable[[], T]) -> T:
     try:
         return build()
     except Exception as error:  # diffusers and transformers have no error of their own for a config that cannot be
-        raise PriorError(f"{where}: its config cannot be used ({_first_line(error)}). Download it again.") from error
-
-
-def _first_line(error: Exception) -> str:
-    """The kind of an error and the first line of what it says."""
-    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:200]}"
+        raise PriorError(f"{where}: its config cannot be used ({first_line(error)}). Download it again.") from error
 
 
 def _check_kind(folder: Folder) -> None:
@@ -248,32 +218,6 @@ def check_memory(folder: Folder, dtype: torch.dtype, device: torch.device, *, of
         )
 
 
-def load(kind: type, path: str | Path, subfolder: str | None, dtype: torch.dtype) -> Any:
-    """A frozen model of diffusers or transformers in evaluation mode, every weight found. Raises PriorError."""
-    from diffusers import ModelMixin
-    from diffusers.utils import is_accelerate_available
-
-    where = Path(path, subfolder) if subfolder else path
-    options: dict[str, Any] = {"subfolder": subfolder} if subfolder else {}
-    if issubclass(kind, ModelMixin):
-        options |= {"torch_dtype": dtype, "low_cpu_mem_usage": is_accelerate_available()}
-    try:
-        model, info = cast(Any, kind).from_pretrained(str(path), output_loading_info=True, **options)
-    except Exception as error:  # each way to store weights raises its own kinds
-        raise PriorError(
-            f"{where}: cannot be loaded as {kind.__name__}: {_first_line(error)} "
-            f"Give a complete folder, or an id that the hub or its local cache has."
-        ) from error
-    if info["missing_keys"]:
-        raise PriorError(
-            f"{where}: {len(info['missing_keys'])} weights of {kind.__name__} are missing, the first "
-            f"'{sorted(info['missing_keys'])[0]}'. Download the folder again; its config and weights do not match."
-        )
-    if model.dtype != dtype:
-        model = model.to(dtype)
-    return model.requires_grad_(False).eval()
-
-
 def load_tokenizer(folder: Folder) -> Any:
     """The folder's CLIPTokenizer. Raises PriorError."""
     from transformers import CLIPTokenizer
@@ -282,10 +226,4 @@ def load_tokenizer(folder: Folder) -> Any:
     for file in (where / "vocab.json", where / "merges.txt"):
         if file.is_file() and not file.stat().st_size:  # with no merges, words would be spelled letter by letter
             raise PriorError(f"{file}: is empty; download the folder again.")
-    try:
-        return CLIPTokenizer.from_pretrained(str(folder.path), subfolder="tokenizer")
-    except Exception as error:  # the library under it raises its own kinds
-        raise PriorError(
-            f"{where}: cannot be loaded: {_first_line(error)} It needs vocab.json and merges.txt; download the folder "
-            "again."
-        ) from error
+    return load_processor(CLIPTokenizer, folder.path, "vocab.json and merges.txt", "tokenizer")

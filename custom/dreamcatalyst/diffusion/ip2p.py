@@ -20,8 +20,9 @@ from ..config import AtLeastOne, Seed
 from ..errors import ConfigError, PriorError, choose
 from .api import Prior, Row
 from .autoencoder import Autoencoder, load_autoencoder
-from .folder import check_memory, load, load_tokenizer, open_folder
+from .folder import check_memory, load_tokenizer, open_folder
 from .freeu import FreeU, FreeUConfig
+from .hub import load
 
 DTYPES = {"fp32": torch.float32, "fp16": torch.float16, "bf16": torch.bfloat16}
 OUT_OF_MEMORY = ("out of memory", "allocate memory", "not enough memory")  # no error class serves all devices

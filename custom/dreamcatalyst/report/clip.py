@@ -14,10 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..diffusion.folder import find_folder, load, not_given
-from ..errors import ConfigError, PriorError
+from ..diffusion.hub import find_folder, load, load_processor, model_config
+from ..errors import ConfigError
 
-EXAMPLE = "openai/clip-vit-large-patch14"
+EXAMPLE, HOLDS = "openai/clip-vit-large-patch14", "config.json, weights and tokenizer of a CLIP"
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # of OpenAI's CLIP, RGB
 
 
@@ -40,21 +40,10 @@ class Clip:
     """
 
     def __init__(self, path: str, device: torch.device | str = "cpu"):
-        from transformers import AutoConfig
-
         self.path, self.device = path, torch.device(device)
-        folder = find_folder(path, "config.json, weights and tokenizer of a CLIP", EXAMPLE)
-        try:
-            config = AutoConfig.from_pretrained(path)
-        except (OSError, ValueError, KeyError) as error:
-            fault = (
-                not_given(path, error) if folder is None else f"{path}: has no config.json of a model that is known."
-            )
-            raise PriorError(fault) from error
-        if config.model_type != "clip":
-            raise PriorError(f"{path}: is a '{config.model_type}', expected a 'clip', such as {EXAMPLE}.")
+        config = model_config(path, HOLDS, {"clip": EXAMPLE})
         self.width, self.side = config.projection_dim, config.vision_config.image_size
-        self.mean, self.std = _standard(folder)
+        self.mean, self.std = _standard(find_folder(path, HOLDS, EXAMPLE))
 
     @cached_property
     def _model(self) -> Any:
@@ -66,13 +55,7 @@ class Clip:
     def _tokenizer(self) -> Any:
         from transformers import CLIPTokenizer
 
-        try:
-            return CLIPTokenizer.from_pretrained(self.path)
-        except (OSError, ValueError, TypeError) as error:
-            raise PriorError(
-                f"{self.path}: the tokenizer cannot be loaded: {str(error).splitlines()[0]} It needs vocab.json and "
-                "merges.txt; download the folder again."
-            ) from error
+        return load_processor(CLIPTokenizer, self.path, "vocab.json and merges.txt")
 
     @torch.no_grad()
     def images(self, images: Tensor) -> Tensor:

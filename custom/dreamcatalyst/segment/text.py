@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..config import Between
-from ..diffusion.folder import find_folder, load, not_given
-from ..errors import ConfigError, PriorError, SceneError
+from ..diffusion.hub import load, load_processor, model_config
+from ..errors import ConfigError, SceneError
 from ..kept import stamp
 from .api import MaskRequest, Segmenter
 
@@ -25,6 +25,9 @@ EXAMPLES = {
     DINO: "IDEA-Research/grounding-dino-tiny",
     SAM: "facebook/sam-vit-base",
 }
+
+
+HOLDS, PROCESSOR = "config.json, weights and preprocessor", "tokenizer and preprocessor_config.json"
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class ClipSeg:
         from transformers import AutoProcessor, CLIPSegForImageSegmentation
 
         self.phrases, self.threshold, self.best = options.phrases, options.threshold or 0.4, 0.0
-        self.processor = _processor(AutoProcessor, options.path)
+        self.processor = load_processor(AutoProcessor, options.path, PROCESSOR)
         self.model = load(CLIPSegForImageSegmentation, options.path, None, torch.float32).to(device)
 
     @torch.no_grad()
@@ -90,7 +93,9 @@ class GroundedSam:
         self.words = " ".join(f"{phrase}." for phrase in options.phrases)  # as the model was trained to read them
         self.threshold, self.best = options.threshold or 0.35, 0.0
         model_type(options.sam, SAM)
-        self.processor, self.sam_processor = (_processor(AutoProcessor, path) for path in (options.path, options.sam))
+        self.processor, self.sam_processor = (
+            load_processor(AutoProcessor, path, PROCESSOR) for path in (options.path, options.sam)
+        )
         self.detector = load(GroundingDinoForObjectDetection, options.path, None, torch.float32).to(device)
         self.sam = load(SamModel, options.sam, None, torch.float32).to(device)
 
@@ -104,12 +109,11 @@ class GroundedSam:
         """Left, top, right, bottom in pixels, [B,4], of everything that is found."""
         inputs = self.processor(images=pixels, text=self.words, return_tensors="pt").to(self.detector.device)
         found = self.detector(**inputs)
-        scores = found.logits[0].sigmoid().amax(dim=-1)  # of the words that a box answers to best
-        self.best = max(self.best, float(scores.max()))
-        x, y, w, h = found.pred_boxes[0][scores > self.threshold].unbind(dim=-1)
-        height, width = pixels.shape[:2]
-        corners = torch.stack([x - w / 2, y - h / 2, x + w / 2, y + h / 2], dim=-1)
-        return corners.clamp(0, 1) * corners.new_tensor([width, height, width, height])
+        self.best = max(self.best, float(found.logits.sigmoid().max()))  # of the words that a box answers to best
+        # By position: the first threshold has had two names. The second is of the words that label a box.
+        find, words = self.processor.post_process_grounded_object_detection, inputs["input_ids"]
+        (kept,) = find(found, words, self.threshold, self.threshold, [pixels.shape[:2]])
+        return kept["boxes"]
 
     @torch.no_grad()
     def cut_out(self, pixels: np.ndarray, boxes: Tensor) -> Tensor:
@@ -126,32 +130,8 @@ MODELS = {CLIPSEG: ClipSeg, DINO: GroundedSam}
 
 
 def model_type(path: str, *wanted: str) -> str:
-    """What kind of model `path` holds (a local folder, or a Hugging Face id that is downloaded once), one of `wanted`.
-
-    Raises PriorError: no such folder, an id that cannot be had, another kind of model.
-    """
-    from transformers import AutoConfig
-
-    folder = find_folder(path, "config.json, weights and preprocessor", EXAMPLES[wanted[0]])
-    try:
-        kind = AutoConfig.from_pretrained(path).model_type
-    except (OSError, ValueError, KeyError) as error:
-        fault = not_given(path, error) if folder is None else f"{path}: has no config.json of a model that is known."
-        raise PriorError(fault) from error
-    if kind not in wanted:
-        good = " or ".join(f"{name} (such as {EXAMPLES[name]})" for name in wanted)
-        raise PriorError(f"{path}: is a '{kind}', expected {good}.")
-    return kind
-
-
-def _processor(kind: type, path: str) -> Any:
-    try:
-        return kind.from_pretrained(path)
-    except (OSError, ValueError, TypeError) as error:
-        raise PriorError(
-            f"{path}: its tokenizer or image processor cannot be loaded: {str(error).splitlines()[0]} "
-            "Download the folder again, complete."
-        ) from error
+    """What kind of model `path` holds, one of `wanted`. Raises PriorError as `model_config`."""
+    return model_config(path, HOLDS, {name: EXAMPLES[name] for name in wanted}).model_type
 
 
 def _pixels(image: Tensor) -> np.ndarray:
