@@ -143,7 +143,7 @@ def test_it_is_told_whether_an_instruction_is_about_everything(source, instructi
     values = yaml.safe_load((ROOT / "configs/dc-ge.yaml").read_text(encoding="utf-8"))["system"]["guidance"]
     world, told = make_world(source), {}
     guidance = Guidance(parse(GuidanceConfig, values | {"seed": 0}, "system.guidance"), instruction)
-    images = {view: rasterize(world.scene, world.cameras[view : view + 1]).rgb[0].clamp(0, 1) for view in (0, 20)}
+    images = {view: rasterize(world.scene, world.cameras[view : view + 1]).rgb[0].clamp(0, 1) for view in (20,)}
     predict = remembered(guidance.prior.predict_noise)
     for by, what in ((1, "all"), (0.3, "text"), (3, "text"), (0.3, "all"), (3, "all")):
         guidance.prior.predict_noise = scaled(predict, by, what)
