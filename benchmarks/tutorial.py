@@ -41,15 +41,16 @@ def blocks(page: str) -> list[Block]:
 
 def script(page: str, steps: int = 0) -> str:
     """What of a page can be run anywhere, as one script. steps: length of each run, and of a resumed one twice that,
-    and masks of two views; 0: as printed."""
+    with small pictures and masks of two views; 0: as printed."""
     text = "".join(block.text for block in blocks(page) if not block.note.startswith("needs:"))
     lines = ["set -euo pipefail", *text.replace("\\\n", " ").splitlines()]
     for i, line in enumerate(lines):
         if steps and line.startswith("python launch.py"):
             length = 2 * steps if "resume=" in line else steps
             command = line.partition("  # ")[0]
-            masked = " system.mask.views=2" if re.search(r"configs/(dc-ge|grow)\.yaml", command) else ""
-            lines[i] = f"{command.rstrip()} trainer.max_steps={length} system.report.video_frames=0{masked}"
+            squared = re.search(r"configs/(dc-ge|grow)\.yaml", command)
+            small = "data.width=64 data.height=64 system.mask.views=2" if squared else "data.max_side=64"
+            lines[i] = f"{command.rstrip()} trainer.max_steps={length} system.report.video_frames=0 {small}"
     return "\n".join(lines) + "\n"
 
 
