@@ -91,7 +91,10 @@ def test_a_page_becomes_a_script():
     assert blocks(page) == [Block("needs: gpu", heavy), Block("", light)]
     assert script(page).split() == ["set", "-euo", "pipefail", *light.replace("\\\n", "").split()]
     short = " ".join(script(page, 3).splitlines()[1].split())
-    assert short == "python launch.py --config a.yaml b=1 trainer.max_steps=3 system.report.video_frames=0 data.max_side=64"
+    assert (
+        short
+        == "python launch.py --config a.yaml b=1 trainer.max_steps=3 system.report.video_frames=0 data.max_side=64"
+    )
 
 
 def launches() -> list[tuple[str, list[str]]]:

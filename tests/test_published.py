@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import cast
 
 import pytest
 import yaml
-from dreamcatalyst.config import load_config, parse
+from dreamcatalyst.config import load_config, merge_open, parse
 from dreamcatalyst.diffusion.noise import stable_diffusion_schedule
 from dreamcatalyst.guidance.config import GuidanceConfig, chosen_rule, chosen_schedule
 from dreamcatalyst.scene.generations import Generations
 from dreamcatalyst.train.edit import EditSystem
+from omegaconf import OmegaConf
 
 import launch
 from tests.test_main_job import flat
@@ -116,7 +118,7 @@ def as_text(values: dict, key: str) -> str:
 
 def test_the_page_names_every_difference_of_the_two_configs():
     published, ours = (
-        flat(yaml.safe_load((ROOT / f"configs/{name}.yaml").read_text(encoding="utf-8")))
+        flat(cast(dict, OmegaConf.to_container(merge_open(ROOT / f"configs/{name}.yaml"))))
         for name in ("dc-ge-published", "dc-ge-ip2p")
     )
     differing = {k for k in {**published, **ours} if as_text(published, k) != as_text(ours, k)} - {"name"}
