@@ -15,6 +15,7 @@ from ..config import AtLeastOne, Colour, Count, NonNegative, Range, Side
 from ..errors import DataError
 from ..registry import Registry
 from .lens import Lens
+from .sfm.options import SfmOptions
 from .truth import GroundTruths, SplatScene
 
 FORMATS = Registry("dataset format", __package__)
@@ -22,6 +23,8 @@ FORMATS.add("colmap", ".colmap:FORMAT")
 FORMATS.add("demo", "..demo.capture:FORMAT")  # imported when it is asked for: demo/ draws with what stands above it
 FORMATS.add("inria", ".inria:FORMAT")
 FORMATS.add("nerfstudio", ".transforms:FORMAT")
+FORMATS.add("photographs", ".photographs:FORMAT")
+FORMATS.add("video", ".video:FORMAT")
 AXES = {f"{sign}{axis}": i for sign in ("", "-") for i, axis in enumerate("xyz")}  # what data.orbit_up may name
 
 
@@ -40,6 +43,7 @@ class CaptureOptions:
     resident_gib: NonNegative = 2.0  # GiB of decoded photographs kept in memory
     background: Colour = (0.0, 0.0, 0.0)  # RGB in [0,1] behind transparent photographs
     dataparser: str = ""  # nerfstudio's dataparser_transforms.json of the splats: cameras are moved into their world
+    sfm: SfmOptions = SfmOptions()  # how the cameras of photographs or of a video are found
     orbit_views: Annotated[int, Range("[1, 10000]")] = 48  # views of an orbit around splats that come without cameras
     orbit_up: str = field(default="-y", metadata={"choices": AXES})  # up in them: -y suits COLMAP's, z nerfstudio's
 

@@ -40,7 +40,7 @@ class Photo:
 
         Shrinking averages over areas. Raises DataError where the file cannot be decoded or has changed its size.
         """
-        image = _decode(self.path, background)
+        image = decode(self.path, background)
         if image.shape[:2] != (self.lens.height, self.lens.width):
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise DataError(f"{self.path}: decodes to {size}, its header said {self.lens.width}x{self.lens.height}")
@@ -87,7 +87,7 @@ def _any_size() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = before
 
 
-def _decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
+def decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
     """RGB uint8 [H,W,3] of an image file as stored: 8 or 16 bits, grey, colour or with alpha."""
     try:
         image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
