@@ -200,8 +200,9 @@ def fit_first(first: Any, args: argparse.Namespace, stop: Any) -> None:
     """Carry out the fit that an edit begins with, or go on with it, or wait for the process that is at it."""
     from dreamcatalyst import plugin
     from dreamcatalyst.config import read_config
+    from dreamcatalyst.kept import alone
     from dreamcatalyst.resume import read_checkpoint
-    from dreamcatalyst.runs import alone, claimed
+    from dreamcatalyst.runs import claimed
     from dreamcatalyst.signals import Stopped
 
     with alone(first.folder, lambda: plugin.info("another process fits these photographs: waiting for it")):

@@ -32,7 +32,7 @@ RUNS = {"resume", "signals"}  # what is about whole runs, and so for the folder 
 OUTSIDE = {  # files of the top level that stand outside the order, and what each may import
     "__init__": {"plugin"},
     "cache": set(),
-    "kept": set(),
+    "kept": {"errors"},
     "memory": set(),
     "meter": set(),
     "errors": set(),
@@ -40,7 +40,7 @@ OUTSIDE = {  # files of the top level that stand outside the order, and what eac
     "registry": {"errors"},
     "plugin": set(),
     "standalone": {"config", "errors", "files"},
-    "runs": {"config", "errors", "files"},
+    "runs": {"config", "errors", "files", "kept"},
     "resume": {"config", "errors", "files", "plugin"},
     "signals": set(),
     "trainer": {"config", "errors", "plugin"},

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import itertools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from . import kept
 from .config import ExperimentConfig
 from .errors import ConfigError
 from .files import clear_parts
@@ -41,7 +41,7 @@ def claimed(config: ExperimentConfig, *, numbered: bool, writes: bool) -> Iterat
         raise _unusable(config, folder, error) from error
     try:
         if writes:
-            _lock(folder, handle)
+            kept.lock(folder, handle)
         _check(folder, replaces=writes and not resumed)
         if writes:
             clear_parts(folder)
@@ -59,26 +59,6 @@ def claimed(config: ExperimentConfig, *, numbered: bool, writes: bool) -> Iterat
                 folder.rmdir()
 
 
-@contextmanager
-def alone(folder: Path, waits: Callable[[], None]) -> Iterator[None]:
-    """Inside the block no other process is inside one for the same folder, which is kept between runs and need not be
-    there: where one is, `waits` is called, and it is waited for. Raises ConfigError."""
-    path = folder.with_name(f"{folder.name}.lock")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise ConfigError(
-            f"{path.parent}: what is kept between runs cannot be written there: {error.strerror or error}. Choose "
-            "another folder: DREAMCATALYST_CACHE=<folder> before the command."
-        ) from error
-    try:
-        _lock(folder, handle, waits)
-        yield
-    finally:
-        os.close(handle)
-
-
 def _make_next(folder: Path) -> Path:
     for number in itertools.count(1):
         path = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
@@ -86,28 +66,6 @@ def _make_next(folder: Path) -> Path:
             path.mkdir()
             return path
     raise RuntimeError("unreachable")
-
-
-def _lock(folder: Path, handle: int, waits: Callable[[], None] | None = None) -> None:
-    """A lock on the folder itself, which leaves no file behind and ends with the process, however that ends. waits:
-    called before another process is waited for; None: that is an error."""
-    try:
-        import fcntl
-    except ImportError:  # Windows has none, and two runs into one folder have to be the user's care there
-        return
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-            if waits is not None:
-                waits()
-                fcntl.flock(handle, fcntl.LOCK_EX)
-                return
-            raise ConfigError(
-                f"{folder}: another process is running in this folder. Wait for it, or choose another: tag=..."
-            ) from error
-        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.EBADF):  # network drives without locks
-            raise
 
 
 def _check(folder: Path, replaces: bool) -> None:

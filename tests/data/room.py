@@ -77,6 +77,15 @@ def photographs(folder: Path, viewmats: torch.Tensor, size: tuple[int, int] = (3
     return folder
 
 
+def video(path: Path, viewmats: torch.Tensor, blurred: tuple[int, ...] = ()) -> Path:
+    """A video of the room at 25 frames per second, `blurred` some of its frames."""
+    written = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25, (320, 240))
+    for i, picture in enumerate(draw(cameras(viewmats))):
+        written.write(cv2.GaussianBlur(picture, (0, 0), 4) if i in blurred else picture)
+    written.release()
+    return path
+
+
 def errors(centres: np.ndarray, rotations: np.ndarray, truth: Cameras) -> tuple[float, float]:
     """The largest error of centres [V,3], as a share of the true cameras' extent, and of rotations [V,3,3] in degrees,
     after the best similarity (Umeyama 1991)."""

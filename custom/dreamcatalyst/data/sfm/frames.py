@@ -23,7 +23,7 @@ CORNERS = 300  # points that are followed from frame to frame
 FARTHER = 0.8  # quantile of the points' distances that counts: around a thing in the middle, the median stands still
 REFERENCE = 0.02  # of the diagonal: when the view has moved so far, new points are taken
 SURVIVE = 0.6  # or when fewer of them are left
-WINDOW = 0.25  # of a step: how far from its place the sharpest frame is looked for
+WINDOW = 0.4  # of a step: how far from its place the sharpest frame is looked for
 REPEATED = 0.25  # grey levels: frames that differ less are one frame, written twice
 FEWEST = 3
 

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import json
-import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ... import kept, plugin
-from ...files import file_digest, unwritable, write_text
+from ...files import file_digest, write_text
 from . import check, orient, picture
 from .colmap import library
 from .options import SfmOptions
@@ -51,59 +48,21 @@ def cameras(
     where they are not kept.
 
     prepare: makes the working copies in the folder that it gets, once, and gives them and what is to be said of them.
-    Raises DataError: no cameras can be found, with the reason; FileError: the folder cannot be made.
+    Raises DataError: no cameras can be found, with the reason; ConfigError: the folder cannot be written.
     """
     asked = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name != "registered"}
     folder = kept.home() / "captures" / kept.digest(VERSION, video, list(contents), asked)
     if not (folder / REPORT).is_file():
-        with exclusive(folder):
+        told = f"cameras: another process finds those of {source}: waiting for it"
+        with kept.alone(folder, lambda: plugin.info(told)):
             if not (folder / REPORT).is_file():
                 _make(folder, source, video, options, prepare)
     return folder
 
 
-@contextmanager
-def exclusive(folder: Path) -> Iterator[None]:
-    """`folder`, which is made, for this process alone inside the block; waits for another one. Raises FileError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-    except OSError as error:
-        raise type(unwritable(folder, error))(
-            f"{folder}: cameras that are found are kept there, and it cannot be written to: {error.strerror}. Choose "
-            "another folder by the environment variable DREAMCATALYST_CACHE"
-        ) from error
-    try:
-        _wait_for(handle, folder)
-        yield
-    finally:
-        os.close(handle)  # and with it the lock, as the process's end does
-
-
-def _wait_for(handle: int, folder: Path) -> None:
-    try:
-        import fcntl
-    except ImportError:  # Windows has none, and two runs on the same photographs have to be the user's care there
-        return None
-    told = False
-    while True:
-        try:
-            return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-                if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP, errno.EBADF):  # network drives without locks
-                    return None
-                raise
-        if not told:
-            plugin.info(f"cameras: another process is finding them in {folder}; waiting for it")
-        told = True
-        time.sleep(0.5)
-
-
 def _make(folder: Path, source: Path, video: bool, options: SfmOptions, prepare: Prepare) -> None:
     began = time.monotonic()
+    folder.mkdir(exist_ok=True)
     plugin.info(f"cameras of {source} are found now, and kept in {folder}. Ctrl-C loses nothing of it")
     pictures, said = _prepared(folder, prepare)
     search = Search(source, folder, pictures, video, options, {"photographs": round(time.monotonic() - began, 1)})
