@@ -33,6 +33,7 @@ from benchmarks.faulty import (  # noqa: E402
     folders,
     masks,
     pairs,
+    photographs,
     priors,
     processes,
     resumes,
@@ -41,7 +42,7 @@ from benchmarks.faulty import (  # noqa: E402
 )
 from benchmarks.faulty.cases import Case, Outcome, Place  # noqa: E402
 
-GROUPS = [commands, values, captures, splats, masks, priors, pairs, resumes, folders, processes]
+GROUPS = [commands, values, captures, photographs, splats, masks, priors, pairs, resumes, folders, processes]
 CASES: list[Case] = [case for group in GROUPS for case in group.CASES]
 SHOWN = 240  # characters of a message in the table
 INTRODUCTION = """# Bad input and faults
@@ -112,6 +113,7 @@ def main(argv: list[str] | None = None) -> int:
     began, rows, failed = time.perf_counter(), [head], []
     with contextlib.ExitStack() as stack:
         root = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="faults-"))).resolve()
+        os.environ["DREAMCATALYST_CACHE"] = str(root / "kept")  # never the user's own
         each = map
         if args.jobs > 1:
             context = multiprocessing.get_context("spawn")

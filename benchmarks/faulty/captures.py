@@ -202,7 +202,7 @@ CASES: list[Case] = [
     fit(G, "an empty value, data.source=", ["data.source="], "data.source"),
     fit(G, "a video file", lambda p: [f"data.source={p.write('walk.mp4', b'ftypmp42' * 30).name}"], "walk.mp4"),
     fit(G, "the PLY in place of the capture", lambda p: [f"data.source={p.copy('scene.ply').name}"], "scene.ply"),
-    fit(G, "the folder of the photographs", lambda p: [f"data.source={p.copy('capture')}/images"], "is no capture"),
+    fit(G, "the folder of the photographs", lambda p: [f"data.source={p.copy('capture')}/images"], "24x18"),
     fit(
         G,
         "the folder above the capture",

@@ -22,7 +22,7 @@ from .pairs import Pair
 from .prepare import Picture
 
 T = TypeVar("T")
-OLDEST = (4, 0)
+OLDEST = (4, 2)
 DRAW = 0.2  # seconds between two looks at what is done
 BLOCK = 64  # pairs that are compared between two looks at the time
 

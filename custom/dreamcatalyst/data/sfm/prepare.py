@@ -196,4 +196,4 @@ def _equirectangular(path: Path, image: Any) -> bool:
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: is cut off or damaged ({error}); copy it again") from error
     steps = np.abs(np.diff(small, axis=1, append=small[:, :1])).mean(axis=0)
-    return bool(steps[-1] < 1.5 * np.median(steps) + 1)
+    return bool(steps[-1] <= np.quantile(steps[:-1], 0.95))
