@@ -26,7 +26,8 @@ CONFIGS = sorted(p.relative_to(ROOT).as_posix() for p in (ROOT / "configs").rglo
 HOSTED = [path for path in CONFIGS if path.startswith("configs/swap/")]  # for the host's systems: checked by running
 
 # The way the data goes: a file imports only from its own place and from what stands to the left of it.
-ORDER = ["config", "data", "scene", "render", "demo", "diffusion", "guidance", "segment", "loss", "report", "train"]
+ORDER = ["config", "data", "scene", "render", "demo", "diffusion", "inpaint"]
+ORDER += ["guidance", "segment", "loss", "report", "train"]
 FOR_ALL = {"cache", "errors", "kept", "memory", "meter", "files", "registry", "plugin"}
 RUNS = {"resume", "signals"}  # what is about whole runs, and so for the folder that assembles them
 OUTSIDE = {  # files of the top level that stand outside the order, and what each may import

@@ -11,6 +11,7 @@ OFFERS = {
     "dreamcatalyst-data": ".train.datamodule",
     "dreamcatalyst-fit-system": ".train.fit",
     "dreamcatalyst-edit-system": ".train.edit",
+    "dreamcatalyst-delete-system": ".train.delete",
     "dreamcatalyst-prior-data": ".train.prior.data",
     "dreamcatalyst-prior-system": ".train.prior.system",
     "dreamcatalyst-guidance": ".host.guidance",

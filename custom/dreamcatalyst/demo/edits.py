@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from ..data.truth import normalised
@@ -27,6 +27,7 @@ from .seasons import autumn, night, snow, sunset
 from .worlds import World
 
 NOTHING = "nothing"  # the edit that leaves a world as it is
+INVISIBLE = -20.0  # logit of an opacity of 2e-9: renderers leave out what is under 1/255
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,29 @@ def _additions() -> list[WorldEdit]:
     ]
 
 
+def without(world: World, thing: str) -> Gaussians:
+    """The world's splats in the same order, those of `thing` so transparent that no renderer draws them."""
+    first, last = world.thing(thing).rows
+    logits = world.scene.logit_opacities.clone()
+    logits[first:last] = INVISIBLE
+    return replace(world.scene, logit_opacities=logits)
+
+
+def _removals() -> list[WorldEdit]:
+    words = ("Remove", "Delete", "Take away", "Erase")
+    return [
+        WorldEdit(
+            f"no {thing}",
+            "object",
+            tuple(f"{word} the {thing}" for word in words),
+            partial(without, thing=thing),
+            thing,
+            0.0,
+        )
+        for thing in THINGS
+    ]
+
+
 HOURS_AND_SEASONS = (  # name, function, whether in a room too, phrases; the paper's wording first
     (
         "sunset",
@@ -204,7 +228,7 @@ def _table() -> dict[str, WorldEdit]:
         for name, apply, indoors, phrases in HOURS_AND_SEASONS
     ]
     edits.append(WorldEdit(NOTHING, "global", NO_CHANGE, lambda world: world.scene, weight=1.5))
-    edits += _additions()
+    edits += [*_additions(), *_removals()]
     return {edit.name: edit for edit in edits}
 
 

@@ -83,16 +83,17 @@ class Folder:
         return torch.cumprod(1 - cast(DDPMScheduler, scheduler).betas.double(), dim=0)
 
 
-def open_folder(path: str, conditioned: bool) -> Folder:
+def open_folder(path: str, conditioned: bool, masked: bool = False) -> Folder:
     """Find the model `path` (a local folder, or a Hugging Face id that is downloaded once) and check its configs.
 
-    conditioned: whether the U-Net must take an image beside the noisy latents (InstructPix2Pix). Raises PriorError.
+    conditioned: whether the U-Net must take an image beside the noisy latents (InstructPix2Pix). masked: and a mask (an
+    inpainting model). Raises PriorError.
     """
     root = _local(path)
     found = {name: _read(root, name, file) for name, file in CONFIGS.items()}
     folder = Folder(root, found["unet"], found["vae"], found["text_encoder"], found["scheduler"])
     _check_kind(folder)
-    _check_channels(folder, conditioned)
+    _check_channels(folder, conditioned, masked)
     width, wanted = folder.text_encoder.get("hidden_size"), folder.unet.get("cross_attention_dim")
     if width != wanted:
         raise PriorError(
@@ -171,19 +172,25 @@ def _check_kind(folder: Folder) -> None:
         )
 
 
-def _check_channels(folder: Folder, conditioned: bool) -> None:
+def _check_channels(folder: Folder, conditioned: bool, masked: bool) -> None:
     latent, got, out = folder.latent_channels, folder.unet.get("in_channels"), folder.unet.get("out_channels")
-    wanted = latent * (2 if conditioned else 1)
+    wanted = latent * (2 if conditioned else 1) + masked
     if got == wanted and out == latent:
         return
     remedy = "Use an InstructPix2Pix or Stable Diffusion 1.x/2.x folder."
-    if conditioned and got == latent:
+    beside = "noisy latents and image latents" if conditioned else "noisy latents"
+    if masked:
+        remedy = "Use a model for inpainting, such as stable-diffusion-v1-5/stable-diffusion-inpainting."
+        beside = "noisy latents, a mask and image latents"
+    elif got == 2 * latent + 1:
+        remedy = "This is a model for inpainting, which configs/delete.yaml takes. " + remedy
+    elif conditioned and got == latent:
         remedy = "This is a text-to-image model: use prior 'sd', or an InstructPix2Pix folder."
     elif not conditioned and got == 2 * latent:
         remedy = "This is an InstructPix2Pix model: use prior 'ip2p', or a text-to-image folder."
     raise PriorError(
         f"{folder.path / 'unet'}: takes {got} channels and gives {out}, expected {wanted} and {latent} "
-        f"({'noisy latents and image latents' if conditioned else 'noisy latents'}). {remedy}"
+        f"({beside}). {remedy}"
     )
 
 

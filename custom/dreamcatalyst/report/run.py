@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -59,7 +59,8 @@ class RunFacts:
     draw: (scene, cameras, **options of `rasterize`) to a Render. picture: index of a view to its present render
     [H,W,3] in [0,1]. references: index to what it is compared with, by name, the aim first. region: index to where a
     view is meant to change, [H,W,1] of 0 and 1, or None. panels: index to labelled pictures. frame: a camera to the
-    labelled pictures of a moment of the video. judge: CLIP's scores, if any.
+    labelled pictures of a moment of the video. judge: CLIP's scores, if any. counts: further numbers for the page, by
+    what they count.
     """
 
     title: str
@@ -81,6 +82,7 @@ class RunFacts:
     panels: Callable[[int], Panels]
     frame: Callable[[Cameras], Panels]
     judge: ClipJudge | None
+    counts: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def report(self) -> Path:

@@ -75,6 +75,7 @@ def write_report(run: RunFacts, record: Record, scores: Mapping[int, Mapping[str
         "splats": run.splats,
         "skipped": record.skipped,
         **({"fit": fit} if (fit := fit_before(run)) else {}),
+        **({"counts": dict(run.counts)} if run.counts else {}),
         "held_out": [run.capture.views[i].name for i in scores],
         "mean": plain(mean),
         "stages": {name: round(value, 3) for name, value in record.clock.stages.items()},
@@ -149,6 +150,7 @@ def make_page(run: RunFacts, record: Record, summary: Mapping, scores: Mapping[i
     if fit := summary.get("fit"):
         tiles |= {"seconds of the fit before": f"{fit['seconds']:,.1f}"}
         tiles |= {"PSNR of that fit, dB": f"{fit['psnr_photo']:.4g}"} if fit.get("psnr_photo") is not None else {}
+    tiles |= {what: f"{count:,}" for what, count in run.counts.items()}
     shown = list(scores)[:: max(1, len(scores) // PICTURES)][:PICTURES]
     given = {
         name: "\n".join(f"{key}: {value}" for key, value in summary[name].items()) for name in ("machine", "versions")

@@ -95,6 +95,11 @@ def feather(means: Float[Tensor, "N 3"], mask: Bool[Tensor, " N"], width: float)
     return update
 
 
+def distances_to(points: Float[Tensor, "P 3"], queries: Float[Tensor, "Q 3"]) -> Float[Tensor, " Q"]:
+    """How far each of `queries` [Q,3] is from the nearest of `points` [P,3], [Q]."""
+    return torch.from_numpy(_nearest(points, queries, 1)[0][:, 0]).to(queries)
+
+
 def _nearest(
     points: Float[Tensor, "P 3"], queries: Float[Tensor, "Q 3"], k: int
 ) -> tuple[Float[np.ndarray, "Q k"], Int[np.ndarray, "Q k"]]:

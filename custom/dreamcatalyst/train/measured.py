@@ -69,6 +69,7 @@ class MeasuredSystem(System):
             panels=method.panels,
             frame=method.video_frame,
             judge=self.judge,
+            counts=method.counts,
         )
 
     def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:

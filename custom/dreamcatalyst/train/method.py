@@ -103,6 +103,11 @@ class Method:
         """The trainable form of `scene`."""
         return Splats(scene)
 
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Further numbers for the report's page, by what they count."""
+        return {}
+
     def describe(self, plan: PlanBuilder) -> None:
         """Add to the plan what only this method builds or leaves out."""
 

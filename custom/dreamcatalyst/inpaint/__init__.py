@@ -1,0 +1,1 @@
+"""Holes in pictures and depths filled from what lies around them."""
