@@ -30,6 +30,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")  # a model that is not there is not
 from benchmarks.faulty import (  # noqa: E402
     captures,
     commands,
+    deletions,
     folders,
     masks,
     pairs,
@@ -42,7 +43,7 @@ from benchmarks.faulty import (  # noqa: E402
 )
 from benchmarks.faulty.cases import Case, Outcome, Place  # noqa: E402
 
-GROUPS = [commands, values, captures, photographs, splats, masks, priors, pairs, resumes, folders, processes]
+GROUPS = [commands, values, captures, photographs, splats, masks, deletions, priors, pairs, resumes, folders, processes]
 CASES: list[Case] = [case for group in GROUPS for case in group.CASES]
 SHOWN = 240  # characters of a message in the table
 INTRODUCTION = """# Bad input and faults

@@ -530,3 +530,14 @@ def test_a_choice_that_is_not_in_its_list_is_to_blame_and_not_what_follows_from_
     assert load_config(path, cli_args=["tag=a", "system.mode=slow"]).trainer["max_steps"] == 5
     with pytest.raises(ConfigError, match=r"system\.mode: unknown value 'fsat'\. Did you mean 'fast'\?"):
         load_config(path, cli_args=["tag=a", "system.mode=fsat"])
+
+
+def test_options_stay_behind_where_another_kind_is_named(tmp_path):
+    """What one kind takes, another does not: options go with their kind, from an overlay as from the command line."""
+    path = tmp_path / "a.yaml"
+    path.write_text("system: {mask: {kind: box, options: {low: 1}, grow: 2}}")
+    texts = ["system.mask.kind=text", "system.mask.options.text=bear"]
+    assert merge_config(path, cli_args=texts).system.mask == {"kind": "text", "options": {"text": "bear"}, "grow": 2}
+    assert merge_config(path, cli_args=["system.mask.kind=none"]).system.mask.options == {}
+    both = merge_config(path, cli_args=["system.mask={kind: box, options: {high: 3}}"]).system.mask.options
+    assert both == {"low": 1, "high": 3}  # the same kind: laid over each other, as everything else

@@ -5,6 +5,7 @@ A file may be an overlay: its key `base` names the YAML that it is laid over, re
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import re
@@ -43,8 +44,22 @@ def merge_open(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: An
 
 
 def _merged(below: DictConfig, above: DictConfig) -> DictConfig:
-    _require_keys(OmegaConf.to_container(below), OmegaConf.to_container(above))
+    first, second = OmegaConf.to_container(below), OmegaConf.to_container(above)
+    _require_keys(first, second)
+    for key in _left_behind(first, second):
+        below = copy.deepcopy(below)
+        OmegaConf.update(below, key, {}, merge=False)
     return cast(DictConfig, OmegaConf.merge(below, above))
+
+
+def _left_behind(below: Any, above: Any, where: str = "") -> Iterator[str]:
+    """The dotted keys of `options` that belong to another `kind` than the one that is laid over it."""
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return
+    if {"kind", "options"} <= below.keys() and above.get("kind", below["kind"]) != below["kind"]:
+        yield f"{where}options"
+    for key in below.keys() & above.keys():
+        yield from _left_behind(below[key], above[key], f"{where}{key}.")
 
 
 def _require_keys(below: Any, above: Any, where: str = "") -> None:

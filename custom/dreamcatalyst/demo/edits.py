@@ -165,7 +165,7 @@ def without(world: World, thing: str) -> Gaussians:
 
 
 def _removals() -> list[WorldEdit]:
-    words = ("Remove", "Delete", "Take away", "Erase")
+    words = ("Remove", "Delete", "Take away", "Erase", "Get rid of", "Cut out")
     return [
         WorldEdit(
             f"no {thing}",
@@ -254,8 +254,9 @@ def apply_edit(world: World, name: str) -> Gaussians:
     edit that adds something leaves all these as they are and appends its own.
 
     Object edits leave all splats but their target's as they are, to the bit. Recolourings and global edits change sh0
-    alone, so that splats can be compared one by one; the animals also move and scale the splats of some parts (ears,
-    muzzle, trunk): those are compared by renders, which are exact from any viewpoint.
+    alone, so that splats can be compared one by one; removals make their target transparent; the animals also move and
+    scale the splats of some parts (ears, muzzle, trunk): those are compared by renders, which are exact from any
+    viewpoint.
     Raises ConfigError for an unknown name or where the target is not in this world.
     """
     return EDITS[choose("edit", name, EDITS)].apply(world)

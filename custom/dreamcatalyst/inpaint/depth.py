@@ -6,6 +6,8 @@ a plane that goes on under a hole is continued exactly, whatever the camera.
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -28,8 +30,8 @@ def continue_depth(depth: Float[Tensor, "H W"], hole: Bool[Tensor, "H W"], ring:
     """
     inverse = 1 / np.maximum(depth.detach().cpu().double().numpy(), NEAREST)
     inside = hole.cpu().numpy()
-    filled, parts = inverse.copy(), np.empty(inside.shape, np.int32)
-    for number in range(1, ndimage.label(inside, output=parts) + 1):
+    filled, (parts, count) = inverse.copy(), cast(tuple[np.ndarray, int], ndimage.label(inside))
+    for number in range(1, count + 1):
         part = parts == number
         around = ndimage.binary_dilation(part, iterations=ring) & ~inside
         if around.sum() >= LEAST:

@@ -49,7 +49,7 @@ class StableDiffusionInpainting(Inpainter):
             text_encoder=load(CLIPTextModel, folder.path, "text_encoder", dtype),
             tokenizer=load_tokenizer(folder),
             unet=load(UNet2DConditionModel, folder.path, "unet", dtype),
-            scheduler=cast(Any, DDIMScheduler.from_config(folder.scheduler)),
+            scheduler=cast(Any, DDIMScheduler.from_config(folder.scheduler, steps_offset=1, clip_sample=False)),
             safety_checker=cast(Any, None),
             feature_extractor=cast(Any, None),
             requires_safety_checker=False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from .. import plugin
 from ..config import Count, Fraction
@@ -25,6 +26,11 @@ class DeleteSystem(SplatSystem):
         heal: dict = field(default_factory=dict)  # what counts as a hole
         ssim_weight: Fraction = 0.2  # of D-SSIM in the loss, the rest is L1
         allow_coarse_fit: bool = False  # take from splats that were fitted to smaller pictures than those of this run
+        first_fit: dict = field(default_factory=dict)  # the fit on the way, where there is no gs_source
         source_cache_mib: Count = 1024  # what is kept of renders of the source
 
     method: DeleteMethod
+
+    def look_ahead(self, data: Any) -> None:
+        super().look_ahead(data)
+        self.method.load_inpainter()

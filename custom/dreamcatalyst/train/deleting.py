@@ -26,6 +26,7 @@ from ..scene.gaussians import Gaussians
 from ..scene.trainable import Splats
 from ..segment.api import EXTRA, NONE, SEGMENTERS, make_mask
 from ..segment.pictures import overlay
+from .edit_config import FirstFitConfig
 from .finite import require_finite
 from .healing import HealConfig, Healed, Healer
 from .plan import PlanBuilder, scene_bytes
@@ -39,6 +40,7 @@ class DeleteParts(SourcedParts):
 
     inpaint: InpaintConfig
     heal: HealConfig
+    first_fit: FirstFitConfig
 
 
 class DeleteMethod(SourcedMethod):
@@ -58,7 +60,7 @@ class DeleteMethod(SourcedMethod):
         if part.mask.kind == NONE:
             kinds = ", ".join(SEGMENTERS.names())
             raise ConfigError(f"system.mask.kind: none names nothing that could be taken away. Known: {kinds}.")
-        self.inpainter, self._loaded = part.inpaint.inpainter(), None
+        self.inpainter, self._loaded, self._loads = part.inpaint.inpainter(), None, True
         self.pictures: dict[int, Tensor] = {}
         self._counts: dict[str, int] = {}
         self._aims = ByteCache(self._cache_bytes)
@@ -74,12 +76,17 @@ class DeleteMethod(SourcedMethod):
 
     # --- a scene to begin with
 
+    def load_inpainter(self) -> None:
+        """Load what fills pictures. Raises PriorError and ConfigError."""
+        if self._loads:
+            self._loaded, self._loads = self.inpainter.load(self.context.device), False
+
     def prepare(self) -> None:
         """Load the inpainter and then the scene, so that a model that is missing is found first."""
         super().prepare()
         if self._prepared:
             return
-        self._loaded = self.inpainter.load(self.context.device)
+        self.load_inpainter()
         self.load_source()
         if self.context.data.cfg.source and self.cfg.thing:
             truth = self.context.data.open().truth(f"Remove the {self.cfg.thing}")
