@@ -14,7 +14,8 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 PACKAGE = Path(__file__).resolve().parents[1] / "custom" / "dreamcatalyst"
-ORDER = ["data", "scene", "render", "demo", "diffusion", "guidance", "segment", "loss", "report", "train", "host"]
+ORDER = ["data", "scene", "render", "demo", "diffusion", "inpaint", "guidance", "segment", "loss", "report"]
+ORDER += ["train", "host"]
 RUNS = "Configs, registries, files, errors."
 INTRODUCTION = "From the docstrings. A file imports only from its own folder and those above it in the list."
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)

@@ -13,6 +13,7 @@ import yaml
 from dreamcatalyst import OFFERS, plugin
 from dreamcatalyst.config import ExperimentConfig, Range, check, load_config, missing_keys, read_yaml
 from dreamcatalyst.diffusion.api import PRIORS
+from dreamcatalyst.inpaint.api import INPAINTERS
 from dreamcatalyst.segment.api import SEGMENTERS
 from omegaconf import OmegaConf
 
@@ -199,7 +200,7 @@ def parsed_classes() -> dict[str, type]:
                 if dataclasses.is_dataclass(hint):
                     add(f"{name}.{key}", hint)
 
-    for registry in (PRIORS, SEGMENTERS):
+    for registry in (PRIORS, SEGMENTERS, INPAINTERS):
         for name in registry.names():
             add(name, registry.get(name))
     for name in OFFERS:

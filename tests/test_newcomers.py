@@ -15,14 +15,16 @@ from dreamcatalyst.data.formats import FORMATS
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.diffusion.api import PRIORS
 from dreamcatalyst.guidance.rules import RULES
+from dreamcatalyst.inpaint.api import INPAINTERS
 from dreamcatalyst.render.api import BACKENDS
 from dreamcatalyst.report.metrics import METRICS
+from dreamcatalyst.scene.gaussians import SH_C0
 from dreamcatalyst.scene.ply import read_ply, write_ply
 from dreamcatalyst.segment.api import SEGMENTERS
 from dreamcatalyst.train.density import DENSITY
 
 TOYS = Path(__file__).parent / "newcomers"
-REGISTRIES = [METRICS, DENSITY, SEGMENTERS, PRIORS, BACKENDS, RULES, FORMATS]
+REGISTRIES = [METRICS, DENSITY, SEGMENTERS, INPAINTERS, PRIORS, BACKENDS, RULES, FORMATS]
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +88,15 @@ def test_a_segmenter_says_which_splats_may_change(edit):
     mask = read_ply(trial / "save" / "last.ply").extra["mask"]
     means = read_ply(trial / "save" / "source.ply").means
     assert int((mask >= 0.5).sum()) == int((means[:, 2] > 0.6).sum()) > 0
+
+
+def test_an_inpainter_fills_the_hole(edit):
+    plain = "system.inpaint={kind: plain, options: {colour: [0, 0, 1]}}"
+    trial = edit("inpainter", plain, "system.heal.views=4", "system.learning_rates.sh0=0", config="delete.yaml")
+    last = read_ply(trial / "save" / "last.ply")
+    added = json.loads((trial / "report" / "summary.json").read_text())["counts"]["splats put in"]
+    colours = last.sh0[len(last) - added :, 0] * SH_C0 + 0.5
+    assert added > 0 and np.allclose(colours.numpy(), (0, 0, 1), atol=1e-5)
 
 
 def test_a_prior_says_what_becomes_of_the_scene(edit):
