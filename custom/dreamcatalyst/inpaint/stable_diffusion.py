@@ -14,11 +14,12 @@ from torch.nn.functional import interpolate
 
 from ..config import DdimSteps, NonNegative, Range, Seed
 from ..diffusion.autoencoder import load_autoencoder
-from ..diffusion.folder import check_memory, load, load_tokenizer, open_folder
+from ..diffusion.folder import check_memory, load_tokenizer, open_folder
+from ..diffusion.hub import load
+from ..diffusion.ip2p import DTYPES
 from ..errors import choose
 from .api import Inpainter
 
-DTYPES = {"fp32": torch.float32, "fp16": torch.float16, "bf16": torch.bfloat16}
 EXAMPLE = "stable-diffusion-v1-5/stable-diffusion-inpainting"
 
 
