@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ..sh import C1, C2, C3, SH_C0
+from ...scene.gaussians import SH_C0
+from ...scene.harmonics import C1, C2, C3
 from .jit import kernel
 
 f32 = np.float32
