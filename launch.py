@@ -176,9 +176,11 @@ def carry_out(args: argparse.Namespace, config: Any, merged: Any, mode: str, sto
             snapshot(config, merged, args.config)
             if not trainer.fast_dev_run:
                 trainer.loggers = [*trainer.loggers, *system.get_loggers()]
-            trainer.fit(system, datamodule=data, ckpt_path=config.resume)
-            if keeper.began is None or trainer.global_step <= keeper.began:
-                raise ConfigError("trainer: no step was taken: an option ended the run before (max_epochs, max_time?).")
+            if system.takes_steps:
+                trainer.fit(system, datamodule=data, ckpt_path=config.resume)
+                if keeper.began is None or trainer.global_step <= keeper.began:
+                    ended = "an option ended the run before (max_epochs, max_time?)."
+                    raise ConfigError(f"trainer: no step was taken: {ended}")
             trainer.test(system, datamodule=data, verbose=args.verbose)
         elif mode == "preview":
             preview(system, data, trainer)

@@ -12,6 +12,7 @@ OFFERS = {
     "dreamcatalyst-fit-system": ".train.fit",
     "dreamcatalyst-edit-system": ".train.edit",
     "dreamcatalyst-delete-system": ".train.delete",
+    "dreamcatalyst-add-system": ".train.add",
     "dreamcatalyst-prior-data": ".train.prior.data",
     "dreamcatalyst-prior-system": ".train.prior.system",
     "dreamcatalyst-guidance": ".host.guidance",

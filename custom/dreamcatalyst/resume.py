@@ -38,7 +38,7 @@ MAY_CHANGE = (
 )
 # Keys that name files. They may change where the content is the same, and must not where it is another.
 NAMES_FILES = (
-    *("system.gs_source", "system.original", "system.mesh", "data.source"),
+    *("system.gs_source", "system.original", "system.mesh", "system.add.path", "data.source"),
     *("system.guidance.prior.path", "system.mask.options.folder"),
 )
 FREE = ("trainer.", "system.guidance.prior.", "system.mask.options.")  # below them, what is not given is not listed

@@ -22,6 +22,7 @@ FOV = 50.0  # degrees, of an image's shorter side
 # Half of the splats lie within the median distance. It is 0.79 of the radius of a full ball, which so takes 4/5 of the
 # image, and leaves room for what is longer than wide.
 MARGIN = 1.6
+LEVEL = 0.01  # weight of the images' own up, for cameras that all look one way
 ROUND = 300.0  # degrees of azimuth from which on a capture goes round
 
 
@@ -118,6 +119,16 @@ def common_point(cameras: Cameras) -> Tensor:
     point = default + torch.linalg.pinv(across.mean(dim=0), rtol=1e-4, hermitian=True) @ missing
     depth = float(((point - centers) * forward).sum(dim=1).mean())
     return (point if depth > 0.1 * reach else default).to(cameras.viewmats.dtype)
+
+
+def world_up(cameras: Cameras) -> Tensor:
+    """The direction [3], unit, that is up in the world of these cameras, if they are held level: at right angles to
+    what is right in their images, as far as those directions tell, and nearest to what is up in them."""
+    viewmats = cameras.viewmats.double()
+    right, up = viewmats[:, 0, :3], normalize(-viewmats[:, 1, :3].mean(dim=0), dim=0)
+    spread = right.T @ right / len(right) - LEVEL * torch.outer(up, up)
+    found = torch.linalg.eigh(spread).eigenvectors[:, 0]
+    return found if float(found @ up) >= 0 else -found
 
 
 def _median(values: Tensor, weights: Tensor) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import DataError
+from ..errors import ConfigError, DataError, nearest
 from .camera import Cameras
 from .formats import CaptureOptions, Points
 from .images import ImageCache, Photo
@@ -142,6 +142,19 @@ class Capture:
         if view.photo is None:
             raise DataError(f"{self.source}: view '{view.name}' has a camera but no photograph")
         return view.photo.load(self.options.background)
+
+
+def view_number(view: str, names: Sequence[str], where: str) -> int:
+    """The view that is meant, of all `names` of a capture: by name, or else by number. where: the key that says it.
+    Raises ConfigError."""
+    if view in names:
+        return list(names).index(view)
+    if view.isdecimal() and int(view) < len(names):
+        return int(view)
+    raise ConfigError(
+        f"{where}: no view '{view}'.{nearest(view, names)} "
+        f"Known: the names of the {len(names)} views, or 0 to {len(names) - 1}."
+    )
 
 
 def split(n: int, options: CaptureOptions, where: object = "capture") -> tuple[list[int], list[int]]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..scene.gaussians import Gaussians
+from ..scene.place import frames
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 OVERLAP = 1.15  # a splat's standard deviation over half the spacing of its neighbours: closed, not blurred
@@ -45,14 +46,6 @@ def sphere_points(n: int) -> Tensor:
     z = 1 - 2 * i / n
     r = (1 - z * z).clamp(min=0).sqrt()
     return torch.stack([r * torch.cos(GOLDEN_ANGLE * i), r * torch.sin(GOLDEN_ANGLE * i), z], -1).float()
-
-
-def frames(normals: Tensor) -> Tensor:
-    """Quaternions [N,4] wxyz that turn the z axis onto `normals` [N,3] (unit)."""
-    q = torch.cat([1 + normals[:, 2:], -normals[:, 1:2], normals[:, :1], torch.zeros_like(normals[:, :1])], -1)
-    flipped = normals[:, 2] < -1 + 1e-6
-    q[flipped] = q.new_tensor([0.0, 1.0, 0.0, 0.0])
-    return torch.nn.functional.normalize(q, dim=-1)
 
 
 def facing(scene: Gaussians) -> Tensor:

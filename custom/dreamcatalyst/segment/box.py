@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ..config import NonNegative, Number, Positive
-from ..errors import ConfigError, nearest
+from ..data.views import view_number
+from ..errors import ConfigError
 from .api import MaskRequest, Segmenter
 
 Point = tuple[Number, Number, Number]
@@ -62,14 +63,7 @@ class Box(Segmenter):
     def number(self, request: MaskRequest) -> int:
         """The view that is meant, of all in the capture: by name, or else by number."""
         view = cast(str, self.view)  # there is one where there is no box and no sphere
-        if view in request.names:
-            return list(request.names).index(view)
-        if view.isdecimal() and int(view) < len(request.names):
-            return int(view)
-        raise ConfigError(
-            f"system.mask.options.view: no view '{view}'.{nearest(view, request.names)} "
-            f"Known: the names of the {len(request.names)} views, or 0 to {len(request.names) - 1}."
-        )
+        return view_number(view, request.names, "system.mask.options.view")
 
     def rectangle(self, width: int, height: int) -> Tensor:
         """The window as a mask [height,width]; a pixel that is cut counts by the part that lies inside."""

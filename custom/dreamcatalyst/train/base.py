@@ -14,6 +14,7 @@ class System(plugin.BaseSystem):
     are in `self.part`, parsed, when `configure` returns."""
 
     Parts: type[Any] = object  # a dataclass: name of a section to its own dataclass
+    takes_steps = True  # whether there is something to train; else a run is a test
     parts: dict[str, type] = {}  # the same by name, for config.check
     part: Any
 

@@ -55,6 +55,8 @@ class Plan:
         size = [readable(part.bytes) if part.bytes else "" for part in self.builds]
         lines = [f"  + {p.name}: {p.note}{f' ({s})' if s else ''}" for p, s in zip(self.builds, size, strict=True)]
         lines += [f"  - {p.name}: {p.note}" for p in self.leaves_out]
+        if not self.pixels:  # a run without steps
+            return "\n".join(["plan", *lines])
         costs = [f"{self.pixels:,} pixels"]
         if self.network_rows:
             costs.append(f"{self.network_rows} rows of the prior")

@@ -114,9 +114,13 @@ class SourcedMethod(Method):
         it is the source, too, and not a change of it."""
         self.source.restrict(EditRegion(scene, editable, is_source))
 
+    def scene_to_keep(self) -> Gaussians:
+        """What the run writes as its source: a copy of it undoes the change."""
+        return self.source.scene
+
     def begin_training(self) -> None:
         comments = [] if self.fitted is None else [self.fitted.comment]
-        path, scene = self.context.save("source.ply"), self.source.scene.to("cpu")
+        path, scene = self.context.save("source.ply"), self.scene_to_keep().to("cpu")
         write_ply(path, scene, origin=self.origin, comments=comments)
         self.compare_with_photos()
 
