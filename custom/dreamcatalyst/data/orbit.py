@@ -22,7 +22,7 @@ FOV = 50.0  # degrees, of an image's shorter side
 # Half of the splats lie within the median distance. It is 0.79 of the radius of a full ball, which so takes 4/5 of the
 # image, and leaves room for what is longer than wide.
 MARGIN = 1.6
-LEVEL = 0.01  # weight of the images' own up, for cameras that all look one way
+LEVEL = 1e-3  # weight of the images' own up, for cameras that all look one way
 ROUND = 300.0  # degrees of azimuth from which on a capture goes round
 
 

@@ -65,7 +65,7 @@ def lamp(scene: Gaussians, facing: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]
     logs = plain_colors(scene).double().clamp_min(DARKEST).log()
     places = min(PLACES, len(scene))
     spots = scene.means.detach().cpu().double().numpy()
-    _, place = kmeans2(spots, places, seed=np.random.default_rng(0), minit="++")
+    _, place = kmeans2(spots, far_apart(spots, places), minit="matrix")
     member = torch.nn.functional.one_hot(torch.from_numpy(place).long(), places).to(facing)
     weights, solution = scene.opacities.detach().double(), facing.new_zeros(3, 3)
 
@@ -81,6 +81,16 @@ def lamp(scene: Gaussians, facing: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]
         misses = (varied - turned @ solution).norm(dim=1)
         weights = scene.opacities.detach().double() / (1 + (misses / (1.48 * misses.median() + 1e-4)) ** 2)
     return solution.to(scene.means)
+
+
+def far_apart(spots: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "K 3"]:
+    """`count` of the spots, each as far as can be from those before it; the first is the one nearest to the middle."""
+    found = [int(np.linalg.norm(spots - spots.mean(axis=0), axis=1).argmin())]
+    away = np.full(len(spots), np.inf)
+    while len(found) < count:
+        away = np.minimum(away, np.linalg.norm(spots - spots[found[-1]], axis=1))
+        found.append(int(away.argmax()))
+    return spots[found]
 
 
 def brightness(pictures: Float[Tensor, "P 3"]) -> Float[Tensor, " 3"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,7 +21,7 @@ STRAY = 1e-3  # part of the splats that may lie below a thing's foot: those of a
 
 @dataclass(frozen=True)
 class Similarity:
-    """x' = scale * rotation x + translation. rotation [3,3]; translation [3], world units of where it leads; float64."""
+    """x' = scale * rotation x + translation. rotation [3,3]; translation [3], units of where it leads; float64."""
 
     rotation: Float[Tensor, "3 3"]
     scale: float
@@ -51,7 +52,7 @@ def moved(scene: Gaussians, to: Similarity) -> Gaussians:
         scene,
         means=means.to(scene.means),
         quats=quats.to(scene.quats),
-        log_scales=(scene.log_scales.double() + torch.tensor(to.scale).double().log()).to(scene.log_scales),
+        log_scales=(scene.log_scales.double() + math.log(to.scale)).to(scene.log_scales),
         sh0=sh[:, :1],
         shN=sh[:, 1:],
     )

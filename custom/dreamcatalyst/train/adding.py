@@ -63,9 +63,9 @@ class Added:
 
     scene: Gaussians
     count: int
-    foot: tuple[float, float, float]
+    foot: list[float]
     height: float
-    gain: tuple[float, float, float]
+    gain: list[float]
     truth: GroundTruth | None
 
     @property
@@ -125,8 +125,7 @@ class Adder:
         if host is not None and self.thing.world is not None and self.thing.scene.sh_degree == 0:
             ideal = relit(self.thing.scene, self.thing.world.light, there.to("cpu"), host.light)
             truth = GroundTruth(joined(scene, ideal.to(scene.means.device)), whole.extra[ADDED][:, None])
-        foot, gain = (tuple(round(float(v), 6) for v in each) for each in (stands.foot, factors.mean(dim=0)))
-        return Added(whole, len(lit), foot, stands.height, gain, truth)
+        return Added(whole, len(lit), stands.foot.tolist(), stands.height, factors.mean(dim=0).tolist(), truth)
 
     # --- where
 
@@ -151,7 +150,9 @@ class Adder:
             return 1.0 if config.scale is None else config.scale
         if not height > 0:
             key = "height" if config.size is None else "size"
-            raise ConfigError(f"system.add.{key}: the thing has no height when it stands. Give system.add.scale instead")
+            raise ConfigError(
+                f"system.add.{key}: the thing has no height when it stands. Give system.add.scale instead"
+            )
         return wanted / height
 
     def foot(self, scene: Gaussians, radius: float, height: float) -> Tensor:
@@ -170,7 +171,8 @@ class Adder:
                 "pixel of the ground, or give system.add.position"
             )
         require_level(ground, self.up, where)
-        return ground.point + level_under(scene, ground.point, self.up, radius, height, self.draw) * self.up
+        above = level_under(scene, ground.point, self.up, radius, height, self.draw)
+        return ground.at_level(self.up.to(ground.point), above)
 
     def warn_of_size(self, there: Gaussians) -> None:
         """Say so where a thing is surely in other units than the scene."""
