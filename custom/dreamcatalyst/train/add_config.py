@@ -13,7 +13,7 @@ from .edit_config import EditParts, PromptConfig
 Point = tuple[Number, Number, Number]
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 LIGHTS = ("shading", "gain", "off")
-Y_UP = (".glb", ".gltf", ".obj", ".dae", ".vrml")  # meshes of these formats stand along y, by their formats or by use
+Y_UP = (".glb", ".gltf", ".obj", ".dae", ".vrml")  # these formats have things stand along y, by what they say or by use
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,9 @@ class AddConfig:
             return self.up
         if self.made:
             return "z"
-        return orbit_up if splats else "y" if Path(self.path).suffix.lower() in Y_UP else "z"
+        if splats:  # whatever the format: all are read into the PLY's axes
+            return orbit_up
+        return "y" if Path(self.path).suffix.lower() in Y_UP else "z"
 
 
 @dataclass(frozen=True)
