@@ -38,9 +38,9 @@ def arguments(argv: list[str]) -> tuple[argparse.Namespace, list[str]]:
     mode = parser.add_mutually_exclusive_group()
     for name, text in {
         "train": "train, then test (the default)",
-        "validate": "render and score the held-out views of a checkpoint (resume=) or PLY (system.gs_source=)",
-        "test": "write the test-time pictures, video and tables of a checkpoint or PLY",
-        "export": "write PLY and video from a checkpoint or PLY",
+        "validate": "render and score the held-out views of a checkpoint (resume=) or splat file (system.gs_source=)",
+        "test": "write the test-time pictures, video and tables of a checkpoint or splat file",
+        "export": "write splats (export.format=ply, spz, sog, gltf ...) and a video from a checkpoint or splat file",
         "print": "print the config, whole: with what it is laid over (base:) and all key=value; for threestudio, say",
         "preview": "the edit of a single view as the prior sees it, in seconds, before a long run is paid for",
     }.items():
@@ -243,7 +243,16 @@ def classes(config: Any) -> dict[str, type]:
         if not issubclass(found[key], base):
             raise ConfigError(f"{key}_type: '{name}' is registered, but is no {base.__name__}.")
         check(found[key], getattr(config, key), key)
+    exported(config)
     return found
+
+
+def exported(config: Any) -> Any:
+    """The parsed section `export`."""
+    from dreamcatalyst.config import parse
+    from dreamcatalyst.train.export import ExportConfig
+
+    return parse(ExportConfig, config.export, "export")
 
 
 def listen(progress: Any, verbose: bool) -> logging.Logger:
@@ -268,6 +277,7 @@ def build(config: Any, parts: dict[str, type], data: Any = None) -> tuple[Any, A
     data = data or parts["data"](config.data)
     system = parts["system"](config.system, resumed=config.resume is not None)
     system.set_save_dir(str(Path(config.trial_dir) / "save"))
+    system.exported_as = exported(config)
     return data, system
 
 

@@ -30,3 +30,4 @@ class ExperimentConfig:
     system: dict = field(default_factory=dict)
     trainer: dict = field(default_factory=dict)  # any option of lightning's Trainer
     checkpoint: dict = field(default_factory=dict)  # any option of lightning's ModelCheckpoint
+    export: dict = field(default_factory=dict)  # what --export writes: train/export.py

@@ -56,7 +56,7 @@ def load_config(*yamls: str | Path, cli_args: Sequence[str] = (), **overrides: A
 
 def _check_first(merged: DictConfig) -> None:
     """Raise ConfigError for what other keys are worked out from, so that none of these is blamed."""
-    for key in ("data", "system", "trainer", "checkpoint"):
+    for key in ("data", "system", "trainer", "checkpoint", "export"):
         section = OmegaConf.select(merged, key)
         if key in merged and section is not None and not isinstance(section, DictConfig):
             raise ConfigError(f"{key}: got {shown(section)}, expected dict ({key}.<key>=<value>).")

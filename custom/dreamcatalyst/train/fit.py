@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .. import plugin
 from ..config import Between, Count, Fraction, Range
+from ..data.views import Capture
 from ..errors import DataError
 from ..loss.image import photometric_loss
 from ..render.api import Render
@@ -25,12 +26,10 @@ class FitMethod(Method):
     """Fits splats to the training photographs; begins with the reconstruction's points, a mesh, or a PLY of splats."""
 
     def first_scene(self) -> Gaussians:
-        cfg, data = self.cfg, self.context.data
-        capture = data.open()
-        if not capture.has_photos:
-            raise DataError(f"{capture.source}: has cameras but no photographs, and a fit needs some.")
-        if cfg.gs_source:
+        cfg = self.cfg
+        if cfg.gs_source:  # which may also be shown and exported, without photographs
             return self.given_scene()
+        capture = self.require_photos()
         if cfg.mesh:
             return from_mesh(cfg.mesh, cfg.mesh_points, cfg.seed, sh_degree=cfg.sh_degree)
         if capture.points is None:
@@ -39,6 +38,16 @@ class FitMethod(Method):
                 "Give some: system.mesh=<point cloud or mesh>, or system.gs_source=<PLY of splats>."
             )
         return from_points(*capture.points, sh_degree=cfg.sh_degree, initial_opacity=cfg.initial_opacity)
+
+    def require_photos(self) -> Capture:
+        """The capture. Raises DataError where it has no photographs."""
+        capture = self.context.data.open()
+        if not capture.has_photos:
+            raise DataError(f"{capture.source}: has cameras but no photographs, and a fit needs some.")
+        return capture
+
+    def begin_training(self) -> None:
+        self.require_photos()
 
     def sh_degree_at(self, step: int, scene: Gaussians) -> int:
         """The degree that has been let in by `step`."""
@@ -51,11 +60,13 @@ class FitMethod(Method):
         return {"photometric": photometric_loss(render.rgb, target, self.cfg.ssim_weight)}, render, {}
 
     @property
-    def fitted(self) -> Fitted:
+    def fitted(self) -> Fitted | None:
+        if not self.capture.has_photos:
+            return Fitted.of(self.cfg.gs_source) if self.cfg.gs_source else None
         return Fitted.at([self.capture.views[i] for i in self.capture.train])
 
     def references(self, index: int) -> dict[str, Tensor]:
-        return {"photo": self.photo(index)}
+        return {"photo": self.photo(index)} if self.capture.has_photos else {}
 
 
 @plugin.register("dreamcatalyst-fit-system")

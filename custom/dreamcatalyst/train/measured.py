@@ -14,6 +14,7 @@ from ..report.results import write_results, write_video_along
 from ..report.run import RunFacts
 from ..report.scores import mean_scores, print_scores
 from .base import System
+from .export import ExportConfig, export
 from .method import Method, MethodParts
 from .result import ResultFiles
 
@@ -24,6 +25,7 @@ class MeasuredSystem(System):
     Method: type[Method] = Method
     Parts = MethodParts
     part: MethodParts
+    exported_as = ExportConfig()  # what --export writes; set by the launcher
 
     def configure(self) -> None:
         super().configure()
@@ -104,6 +106,11 @@ class MeasuredSystem(System):
         """Export needs no view of its own."""
 
     def on_predict_epoch_end(self) -> None:
-        folder = f"it{self.true_global_step}-export"
-        write_video_along(self.facts(), self.save_path(f"{folder}/video.mp4"))
-        plugin.info(f"exported to {self.write_splats(f'{folder}/point_cloud.ply').parent}")
+        method, held_out = self.method, self.method.context.data.held_out
+        folder, views = Path(self.get_save_dir()) / f"it{self.true_global_step}-export", self.exported_as.views
+        cameras = [method.camera(index) for index in held_out[:: max(1, len(held_out) // max(views, 1))][:views]]
+        scene, fitted = method.splats.scene.detach(), method.fitted
+        export(self.exported_as, folder, scene, method.origin, fitted, method.draw, cameras, plugin.info)
+        video = write_video_along(self.facts(), folder / "video.mp4")
+        if video is not None:
+            plugin.info(f"exported to {video}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -57,7 +57,8 @@ class SplatFormat:
     path; None for a format that is read alone. options: a dataclass of what may be asked for when writing.
     loses: what the file does not hold exactly, in words; empty: everything is exact. sh_degree: the highest it holds.
     extras: whether further columns are kept. order(scene): the rows in the order in which they are best written.
-    comments(path): what was written as comments, from where the format keeps such.
+    comments(path): what was written as comments, from where the format keeps such. implied: options that go with a
+    suffix, where it is asked for by a file's name.
     """
 
     title: str
@@ -71,6 +72,7 @@ class SplatFormat:
     extras: bool = False
     order: Callable[[Gaussians], Tensor] | None = None
     comments: Callable[[Path], list[str]] | None = None
+    implied: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -85,16 +87,19 @@ class Written:
 # --- reading
 
 
-def read_splats(path: str | Path, *, drop_nonfinite: bool = False, origin: Origin = ZERO) -> Gaussians:
+def read_splats(
+    path: str | Path, *, drop_nonfinite: bool = False, origin: Origin = ZERO, quiet: bool = False
+) -> Gaussians:
     """Splats of a file of any format, to be drawn: without NaN and Inf, and without positions and scales whose squares
     float32 does not hold, as they come of files whose scales are no logarithms.
 
     Content decides the format, whatever the name says. drop_nonfinite: leave such splats out and print how many,
-    instead of raising. origin: the point of the file's world that becomes (0,0,0). Raises SceneError.
+    instead of raising. origin: the point of the file's world that becomes (0,0,0). quiet: without what there is to say
+    of the file. Raises SceneError.
     """
     path, format, notices = find_format(path)
     found = format.read(path, origin)
-    for notice in [*notices, *found.notices]:
+    for notice in [] if quiet else [*notices, *found.notices]:
         print(f"{path}: {notice}")
     return drawable(path, found.scene, drop_nonfinite, origin)
 
@@ -132,31 +137,30 @@ def find_format(path: str | Path) -> tuple[Path, SplatFormat, list[str]]:
         raise SceneError(f"{path}: no such file." + (f" Did you mean '{path.with_name(near[0])}'?" if near else ""))
     with path.open("rb") as file:
         head = file.read(HEAD)
-    formats, named = [SPLATS.get(name) for name in SPLATS.names()], named_format(path)
+    formats, by_name = [SPLATS.get(name) for name in SPLATS.names()], named(path)
     for format in formats:
         if format.detect(path, head):
-            other = named is not None and not _is_named(path, format)
+            other = by_name is not None and not path.name.lower().endswith(format.suffixes)
             return path, format, [f"is a {format.title}, whatever its name says"] if other else []
-    if named is None:
+    if by_name is None:
         known = "; ".join(f"{format.title} ({', '.join(format.suffixes)})" for format in formats)
         raise SceneError(f"{path}: is no splat file that is known by its content or its name. Known: {known}")
-    return path, named, []
+    return path, by_name[0], []
 
 
-def named_format(path: str | Path) -> SplatFormat | None:
-    """The format that a file's name speaks of: the one with the longest suffix that fits; None for other names."""
+def named(path: str | Path) -> tuple[SplatFormat, str] | None:
+    """The format that a file's name speaks of, and its suffix: the longest that fits; None for other names."""
     lower = Path(path).name.lower()
     fits = [
-        (len(suffix), -place, name)
+        (len(suffix), -place, name, suffix)
         for name in SPLATS.names()
         for place, suffix in enumerate(SPLATS.get(name).suffixes)
         if lower.endswith(suffix)
     ]
-    return SPLATS.get(max(fits)[2]) if fits else None
-
-
-def _is_named(path: Path, format: SplatFormat) -> bool:
-    return any(path.name.lower().endswith(suffix) for suffix in format.suffixes)
+    if not fits:
+        return None
+    _, _, name, suffix = max(fits)
+    return SPLATS.get(name), suffix
 
 
 def require_room(path: Path, count: int, bytes_each: float = RENDERED) -> None:
@@ -205,11 +209,12 @@ def write_splats(
 
 def writer(format: str, options: Mapping[str, Any], where: str = "export") -> tuple[SplatFormat, Any]:
     """A format that can be written, and its options. Raises ConfigError."""
-    kind: SplatFormat = SPLATS.get(format, f"{where}.format")
+    place = f"{where}." if where else ""
+    kind: SplatFormat = SPLATS.get(format, f"{place}format")
     if kind.write is None:
         known = ", ".join(name for name in SPLATS.names() if SPLATS.get(name).write is not None)
-        raise ConfigError(f"{where}.format: '{format}' is only read, not written. Written are: {known}.")
-    return kind, parse(kind.options, options, f"{where}.options")
+        raise ConfigError(f"{place}format: '{format}' is only read, not written. Written are: {known}.")
+    return kind, parse(kind.options, options, f"{place}options")
 
 
 def with_suffix(stem: Path, suffix: str) -> Path:

@@ -217,4 +217,5 @@ FORMAT = SplatFormat(
     GltfOptions,
     loses="the last digit of scales and opacities",
     comments=comments,
+    implied={".gltf": {"separate": True}},
 )

@@ -115,10 +115,9 @@ def _bundle(stem: Path, meta: dict[str, Any], pictures: dict[str, bytes]) -> Pat
 
 def _folder(stem: Path, meta: dict[str, Any], pictures: dict[str, bytes]) -> Path:
     """The pictures first: a folder without meta.json is no SOG yet."""
-    folder = stem.with_name(f"{stem.name}_sog")
     for name, data in pictures.items():
-        write_bytes(folder / name, data)
-    return write_text(folder / META, json.dumps(meta))
+        write_bytes(stem / name, data)
+    return write_text(stem / META, json.dumps(meta))
 
 
 FORMAT = SplatFormat(
@@ -131,4 +130,5 @@ FORMAT = SplatFormat(
     loses="16-bit logarithmic positions, 8 bits a scale, rotation, colour and opacity, SH from a palette",
     order=morton_order,
     comments=comments,
+    implied={"meta.json": {"bundle": False}},
 )
