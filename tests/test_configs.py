@@ -37,6 +37,8 @@ def overrides(path: str, models: dict[str, Path], folder: Path) -> list[str]:
     given = [f"system.prompt_processor.{key}=make it snow" for key in words if words[key] == "???"]
     if "gs_source" in config["system"] and config["data"]["source"] == "???":
         given += ["data.source=demo:statue", "system.gs_source=''"]
+    if config["data"]["source"] == "":
+        given.append("data.source=demo:statue")
     guidance = config["system"].get("guidance", {})
     if guidance.get("prior_type") in models:
         given.append(f"system.guidance.prior.path={models[guidance['prior_type']]}")

@@ -18,13 +18,14 @@ from dreamcatalyst.guidance.rules import RULES
 from dreamcatalyst.inpaint.api import INPAINTERS
 from dreamcatalyst.render.api import BACKENDS
 from dreamcatalyst.report.metrics import METRICS
+from dreamcatalyst.scene.formats.api import SPLATS
 from dreamcatalyst.scene.gaussians import SH_C0
 from dreamcatalyst.scene.ply import read_ply, write_ply
 from dreamcatalyst.segment.api import SEGMENTERS
 from dreamcatalyst.train.density import DENSITY
 
 TOYS = Path(__file__).parent / "newcomers"
-REGISTRIES = [METRICS, DENSITY, SEGMENTERS, INPAINTERS, PRIORS, BACKENDS, RULES, FORMATS]
+REGISTRIES = [METRICS, DENSITY, SEGMENTERS, INPAINTERS, PRIORS, BACKENDS, RULES, FORMATS, SPLATS]
 
 
 @pytest.fixture(autouse=True)
@@ -124,6 +125,23 @@ def test_a_format_is_found_by_its_files(edit, tmp_path):
     splats = write_ply(tmp_path / "statue.ply", make_world("statue").scene)
     trial = edit("format", f"data.source={tmp_path / 'eyes'}", f"system.gs_source={splats}", "data.test_every=3")
     assert json.loads((trial / "report" / "summary.json").read_text())["held_out"] == ["eye-0", "eye-3"]
+
+
+def test_a_splat_format_is_written_and_read(launch, tmp_path, capsys):
+    toy, orbit = f"imports=[{TOYS / 'splats.py'}]", ["data.source=", "data.orbit_views=4"]
+    splats, text = write_ply(tmp_path / "statue.ply", make_world("statue").scene), tmp_path / "statue.round"
+    launch("convert.yaml", toy, *orbit, f"system.gs_source={splats}", f"export.path={text}", mode="--export")
+    assert len(text.read_text().splitlines()) == 1 + len(read_ply(splats))
+    said = capsys.readouterr()
+    assert "list of round splats: shapes. PSNR of renders" in said.out + said.err
+    launch(
+        "convert.yaml", toy, *orbit, f"system.gs_source={text}", f"export.path={tmp_path / 'b.spz'}", mode="--export"
+    )
+    assert "all splats are round" in capsys.readouterr().out
+    launch(
+        "convert.yaml", *orbit, f"system.gs_source={splats}", "export.format=rounder", toy, mode="--export", status=2
+    )
+    assert "Did you mean 'round'?" in capsys.readouterr().err
 
 
 def test_a_rule_moves_the_splats_otherwise(edit):

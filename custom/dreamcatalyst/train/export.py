@@ -83,12 +83,12 @@ def export(
     comments = [] if fitted is None else [fitted.comment]
     stem, options = config.stem(folder), config.all_options
     written = write_splats(stem, scene, config.chosen, options=options, origin=origin, comments=comments)
-    kind, size = SPLATS.get(config.chosen), written.path.stat().st_size
+    kind = SPLATS.get(config.chosen)
     if written.left_out:
         say(f"a {kind.title} does not hold {' and '.join(written.left_out)}")
     if kind.loses and config.views:
         say(f"{kind.title}: {kind.loses}. {loss_of(written, origin, draw, cameras)}")
-    say(f"exported to {written.path} ({size / 2**20:.1f} MiB)")
+    say(f"exported to {written.path}")
     return written.path
 
 

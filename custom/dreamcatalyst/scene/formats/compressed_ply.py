@@ -28,6 +28,7 @@ from .quantized import (
     opacity_bytes,
     opacity_logits,
     restore_largest,
+    sh_bytes,
     unit,
     world_positions,
 )
@@ -101,8 +102,8 @@ def write(stem: Path, scene: Gaussians, origin: Origin, comments: Sequence[str],
     tables = {"chunk": chunk, "vertex": vertex}
     k = scene.shN.shape[1]
     if k:
-        rest = scene.shN.float().transpose(1, 2).reshape(count, 3 * k).numpy()
-        steps = np.clip((rest / WIDTH + 0.5) * 256, 0, 255).astype(np.uint8)
+        middles = scene.shN.float().numpy() - WIDTH / 512  # a byte stands for the middle of its step
+        steps = np.ascontiguousarray(sh_bytes(middles, WIDTH, np.ones(k)).transpose(0, 2, 1)).reshape(count, 3 * k)
         tables["sh"] = steps.view([(f"f_rest_{i}", "u1") for i in range(3 * k)])[:, 0]
     path = with_suffix(stem, ".compressed.ply")
     with replacing(path) as part:
@@ -135,7 +136,7 @@ def _sh(path: Path, tables: dict[str, np.ndarray], count: int) -> Float[np.ndarr
     values = ((steps - 0.5) * WIDTH).astype(np.float32)
     packed = np.ascontiguousarray(table[names]).view(np.uint8) if list(table.dtype.names or ()) != names else table
     bytes_ = packed.view(np.uint8).reshape(count, 3, len(names) // 3)
-    return values[bytes_.transpose(0, 2, 1)]
+    return values[np.ascontiguousarray(bytes_.transpose(0, 2, 1))]
 
 
 def _chunked(values: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

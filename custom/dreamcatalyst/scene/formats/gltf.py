@@ -92,10 +92,10 @@ def _splats(file: GltfFile, primitive: dict[str, Any], extension: dict[str, Any]
     require_room(file.path, count)
     degree = max((d for d in REST if f"{KHR}:SH_DEGREE_{d}_COEF_0" in attributes), default=0)
     names = [f"{KHR}:SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
-    sh = np.empty((count, len(names), 3), np.float32)
+    shN = np.empty((count, len(names) - 1, 3), np.float32)
     scales, opacities = numbers(f"{KHR}:SCALE", 3), numbers(f"{KHR}:OPACITY", 1)[:, 0]
-    columns = [numbers(name, 3) for name in names]
-    lengths = {len(column) for column in (means, quats, scales, opacities, *columns)}
+    sh0, *columns = [numbers(name, 3) for name in names]
+    lengths = {len(column) for column in (means, quats, scales, opacities, sh0, *columns)}
     if lengths != {count} or count == 0:
         raise SceneError(
             f"{file.path}: its attributes have {sorted(lengths)} rows, expected one number of them, over 0"
@@ -103,7 +103,7 @@ def _splats(file: GltfFile, primitive: dict[str, Any], extension: dict[str, Any]
     for start in range(0, count, 4096):  # attribute by attribute misses the cache
         rows = slice(start, start + 4096)
         for place, column in enumerate(columns):
-            sh[rows, place] = column[rows]
+            shN[rows, place] = column[rows]
     if not (scales >= 0).all() or not ((opacities >= 0) & (opacities <= 1)).all():
         raise SceneError(f"{file.path}: has negative scales, or opacities outside of 0 to 1")
     opacities = np.clip(opacities.astype(np.float64), NEAR, 1 - NEAR)
@@ -112,8 +112,8 @@ def _splats(file: GltfFile, primitive: dict[str, Any], extension: dict[str, Any]
         unit(quats.astype(np.float32)[:, [3, 0, 1, 2]]),
         np.log(np.maximum(scales, np.float32(SMALLEST))),
         np.log(opacities / (1 - opacities)),
-        sh[:, 0],
-        sh[:, 1:],
+        sh0,
+        shN,
         ZERO,
     )
 

@@ -24,7 +24,8 @@ class GltfFile:
     """One file. tree: its JSON. Raises SceneError for what is no glTF 2.0, or damaged."""
 
     def __init__(self, path: Path):
-        self.path, self._buffers = path, {}
+        self.path = path
+        self._buffers: dict[Any, bytes | memoryview] = {}
         data = path.read_bytes()
         text = data
         if data.startswith(MAGIC):
@@ -39,7 +40,7 @@ class GltfFile:
         if str(tree["asset"].get("version", "")).split(".")[0] != "2":
             raise SceneError(f"{path}: is glTF version {tree['asset'].get('version')!r}, expected 2.0")
 
-    def _chunks(self, data: bytes) -> tuple[bytes, bytes]:
+    def _chunks(self, data: bytes) -> tuple[bytes, memoryview]:
         """The JSON and the binary data of a .glb."""
         if len(data) < 20:
             raise SceneError(f"{self.path}: is truncated: {len(data)} bytes, expected 20 of a .glb's header")
@@ -57,7 +58,7 @@ class GltfFile:
             at += 8 + size
         if JSON_CHUNK not in found:
             raise SceneError(f"{self.path}: is a .glb without JSON; it is damaged")
-        return bytes(found[JSON_CHUNK]), found.get(BIN_CHUNK, b"")
+        return bytes(found[JSON_CHUNK]), found.get(BIN_CHUNK, memoryview(b""))
 
     def item(self, kind: str, index: Any) -> dict[str, Any]:
         """An entry of one of the lists at the top (accessors, nodes ...)."""

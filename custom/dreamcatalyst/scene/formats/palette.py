@@ -95,9 +95,14 @@ def _nearest_of_cells(vectors: Tensor, middles: Tensor, entries: Tensor, ends: T
 def codebook(
     values: Float[np.ndarray, " M"], size: int = 256, rounds: int = 20
 ) -> tuple[Float[np.ndarray, " P"], UInt8[np.ndarray, " M"]]:
-    """`size` numbers, rising, and which of them stands for each of `values`: k-means on a line, where it is exact in
-    each round and quick, since cells are stretches of the sorted values."""
-    ordered = np.sort(values.astype(np.float64))
+    """`size` numbers, rising, and which of them stands for each of `values`: k-means on a line, where cells are
+    stretches of the sorted values.
+
+    Half of what is fitted is spread evenly over the range: rare values, such as the scales of a scene's few large
+    splats, count for more in a picture than in a mean of squares.
+    """
+    even = np.linspace(values.min(), values.max(), min(len(values), 1 << 16)).repeat(max(1, len(values) >> 16))
+    ordered = np.sort(np.concatenate([values, even]).astype(np.float64))
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
     spread = np.linspace(ordered[0], ordered[-1], size)
     entries = (np.quantile(ordered, (np.arange(size) + 0.5) / size) + spread) / 2

@@ -17,6 +17,7 @@ OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the component
 # In the order of the SH bases of degree 1 to 3 (Kerbl et al. 2023): the axes in whose sign each is odd.
 ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 REST = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients above degree 0, by SH degree
+BLOCK = 8192  # splats
 Signs = tuple[int, int, int]
 
 
@@ -48,7 +49,22 @@ def world_positions(scene: Gaussians, origin: Origin) -> Float[np.ndarray, "N 3"
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """Rounded to whole numbers in 0..255."""
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    out = np.rint(values)
+    np.maximum(out, 0, out=out)
+    return np.minimum(out, 255, out=out).astype(np.uint8)
+
+
+def sh_bytes(shN: Float[np.ndarray, "N K 3"], width: float, steps: np.ndarray) -> UInt8[np.ndarray, "N K 3"]:
+    """SH coefficients above degree 0 as 256ths of a range of `width` around 0, of which 128 is 0, in multiples of
+    `steps` [K]. Block by block, so that all stays in cache."""
+    out, each = np.empty(shN.shape, np.uint8), steps.astype(np.float32)[:, None]
+    per_step, middle = 256 / width / each, 128 / each
+    for start in range(0, len(shN), BLOCK):
+        rows = slice(start, start + BLOCK)
+        values = np.rint(shN[rows] * per_step + middle) * each
+        np.maximum(values, 0, out=values)
+        out[rows] = np.minimum(values, 255, out=values)
+    return out
 
 
 def opacity_bytes(logits: Float[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:

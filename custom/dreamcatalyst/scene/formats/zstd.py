@@ -8,7 +8,7 @@ from typing import Any
 
 from ...errors import SceneError
 
-LEVEL = 9
+LEVEL = 5
 
 
 def compress(data: bytes) -> bytes:
