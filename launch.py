@@ -249,10 +249,9 @@ def classes(config: Any) -> dict[str, type]:
 
 def exported(config: Any) -> Any:
     """The parsed section `export`."""
-    from dreamcatalyst.config import parse
-    from dreamcatalyst.train.export import ExportConfig
+    from dreamcatalyst.train.export import read_export
 
-    return parse(ExportConfig, config.export, "export")
+    return read_export(config.export)
 
 
 def listen(progress: Any, verbose: bool) -> logging.Logger:

@@ -32,6 +32,7 @@ from benchmarks.faulty import (  # noqa: E402
     commands,
     deletions,
     folders,
+    formats,
     masks,
     pairs,
     photographs,
@@ -43,7 +44,8 @@ from benchmarks.faulty import (  # noqa: E402
 )
 from benchmarks.faulty.cases import Case, Outcome, Place  # noqa: E402
 
-GROUPS = [commands, values, captures, photographs, splats, masks, deletions, priors, pairs, resumes, folders, processes]
+GROUPS = [commands, values, captures, photographs, splats, formats, masks, deletions]
+GROUPS += [priors, pairs, resumes, folders, processes]
 CASES: list[Case] = [case for group in GROUPS for case in group.CASES]
 SHOWN = 240  # characters of a message in the table
 INTRODUCTION = """# Bad input and faults

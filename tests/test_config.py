@@ -460,7 +460,7 @@ def test_a_resumed_run_stays_in_its_trial(written, tmp_path):
     assert load_config(run, cli_args=[f"resume={elsewhere}"]).trial_name.startswith("a@")
 
 
-def test_the_experiment_has_the_hosts_fields_and_imports():
+def test_the_experiment_has_the_hosts_fields_and_imports_and_export():
     names = {f for f in ExperimentConfig.__dataclass_fields__}
     assert names == {
         *("name", "description", "tag", "seed", "use_timestamp", "timestamp", "exp_root_dir", "exp_dir", "trial_name"),
@@ -475,6 +475,7 @@ def test_the_experiment_has_the_hosts_fields_and_imports():
             "system",
             "trainer",
             "checkpoint",
+            "export",
         ),
     }
 

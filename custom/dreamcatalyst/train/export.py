@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ..config import Count
+from ..config import Count, parse
 from ..data.camera import Cameras
 from ..data.origin import Origin
 from ..errors import ConfigError
@@ -30,14 +30,6 @@ class ExportConfig:
     path: str | None = None  # the file to write; None: point_cloud.* in the trial's save/it<step>-export
     options: dict = field(default_factory=dict)  # of the format
     views: Count = 4  # views at which the renders of a lossy format are compared with those before; 0: none
-
-    def __post_init__(self) -> None:
-        writer(self.chosen, self.all_options, "")
-        if self.path is not None and self.stem(Path()).name in ("", ".", ".."):
-            raise ConfigError(f"path: '{self.path}' names no file, expected one such as splats.spz.")
-        given = self._named
-        if given is not None and self.format is not None and given[0] is not SPLATS.get(self.format):
-            raise ConfigError(f"path: '{self.path}' is the name of a {given[0].title}, and format is '{self.format}'.")
 
     @property
     def _named(self) -> tuple[SplatFormat, str] | None:
@@ -66,6 +58,18 @@ class ExportConfig:
             return path
         kept = path.name[: -len(by_name[1])]
         return path.with_name(kept) if kept else path.parent  # meta.json stands for its folder
+
+
+def read_export(section: Any) -> ExportConfig:
+    """The section `export`, checked. Raises ConfigError."""
+    config = parse(ExportConfig, section, "export")
+    writer(config.chosen, config.all_options)
+    path, given = config.path, config._named
+    if path is not None and config.stem(Path()).name in ("", ".", ".."):
+        raise ConfigError(f"export.path: '{path}' names no file, expected one such as splats.spz.")
+    if given is not None and config.format is not None and given[0] is not SPLATS.get(config.format):
+        raise ConfigError(f"export.path: '{path}' is the name of a {given[0].title}; export.format is {config.format}.")
+    return config
 
 
 def export(

@@ -207,14 +207,13 @@ def write_splats(
     return Written(write(stem, scene, origin, comments, parsed), scene, left_out)
 
 
-def writer(format: str, options: Mapping[str, Any], where: str = "export") -> tuple[SplatFormat, Any]:
+def writer(format: str, options: Mapping[str, Any]) -> tuple[SplatFormat, Any]:
     """A format that can be written, and its options. Raises ConfigError."""
-    place = f"{where}." if where else ""
-    kind: SplatFormat = SPLATS.get(format, f"{place}format")
+    kind: SplatFormat = SPLATS.get(format, "export.format")
     if kind.write is None:
         known = ", ".join(name for name in SPLATS.names() if SPLATS.get(name).write is not None)
-        raise ConfigError(f"{place}format: '{format}' is only read, not written. Written are: {known}.")
-    return kind, parse(kind.options, options, f"{place}options")
+        raise ConfigError(f"export.format: '{format}' is only read, not written. Written are: {known}.")
+    return kind, parse(kind.options, options, "export.options")
 
 
 def with_suffix(stem: Path, suffix: str) -> Path:
