@@ -24,7 +24,7 @@ from ..errors import ConfigError, SceneError, nearest
 from ..render.ground import ground_at, level_under, require_level
 from ..scene import light
 from ..scene.create import flat_splats
-from ..scene.formats.api import named_format, read_splats, splat_origin
+from ..scene.formats.api import named, read_splats, splat_origin
 from ..scene.formats.gltf import KHR
 from ..scene.formats.gltffile import GltfFile
 from ..scene.gaussians import Gaussians
@@ -101,7 +101,7 @@ def is_splats(path: Path) -> bool:
         return "opacity" in columns or "packed_position" in columns
     if suffix in (".glb", ".gltf"):
         return KHR in GltfFile(path).tree.get("extensionsUsed", [])
-    return named_format(path) is not None
+    return named(path) is not None
 
 
 class Adder:
