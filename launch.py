@@ -164,11 +164,11 @@ def carry_out(args: argparse.Namespace, config: Any, merged: Any, mode: str, sto
     trainer = make_trainer(config, [progress, keeper], checkpoints, training)
     data, system = build(config, parts, first.data if first else None)
     if first is not None:
-        if not first.done:
+        if not (went := first.told):
             system.to(trainer.strategy.root_device).look_ahead(data)
-            fit_first(first, args, stop)
+            went = fit_first(first, args, stop)
             listen(progress, args.verbose)
-        log.info(first.text)
+        log.info(first.text(went))
     checkpoints.made_by["contents"] = contents(made_by) if training else {}
     log.info(f"{mode}: {config.trial_dir}")
     try:
@@ -198,27 +198,22 @@ def carry_out(args: argparse.Namespace, config: Any, merged: Any, mode: str, sto
         raise
 
 
-def fit_first(first: Any, args: argparse.Namespace, stop: Any) -> None:
-    """Carry out the fit that an edit begins with, or go on with it, or wait for the process that is at it."""
+def fit_first(first: Any, args: argparse.Namespace, stop: Any) -> dict[str, Any]:
+    """Carry out the fit that an edit begins with, or go on with it, or wait for the process that is at it; how it
+    went."""
     from dreamcatalyst import plugin
     from dreamcatalyst.config import read_config
     from dreamcatalyst.kept import alone
-    from dreamcatalyst.resume import read_checkpoint
     from dreamcatalyst.runs import claimed
     from dreamcatalyst.signals import Stopped
 
     with alone(first.folder, lambda: plugin.info("another process fits these photographs: waiting for it")):
-        if first.done:
-            return
-        first.clear()
-        mode = "train"
-        if first.checkpoint.is_file():
-            first.merged.resume = str(first.checkpoint)
-            done = read_checkpoint(first.checkpoint, to_train=False)["global_step"]
-            mode = "train" if done < first.steps else "test"
-            plugin.info(f"the fit to the photographs of {first.source} goes on from step {done:,} of {first.steps:,}")
-        else:
-            plugin.info(f"no system.gs_source: splats are fitted to the photographs of {first.source} first")
+        if told := first.told:
+            return told
+        step = first.begin()
+        where = f"goes on from step {step:,} of {first.steps:,}" if step else "comes first: no splats are given"
+        plugin.info(f"the fit of splats to the photographs of {first.source} {where}")
+        mode = "train" if step < first.steps else "test"
         with claimed(read_config(first.merged), numbered=False, writes=True) as config:
             try:
                 carry_out(argparse.Namespace(config=FIT, verbose=args.verbose), config, first.merged, mode, stop)
@@ -226,6 +221,7 @@ def fit_first(first: Any, args: argparse.Namespace, stop: Any) -> None:
                 plugin.info("the fit so far is kept: the same command goes on with it")
                 raise
         first.finish()
+    return first.told
 
 
 def classes(config: Any) -> dict[str, type]:

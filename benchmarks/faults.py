@@ -31,6 +31,7 @@ from benchmarks.faulty import (  # noqa: E402
     captures,
     commands,
     deletions,
+    fits,
     folders,
     formats,
     masks,
@@ -44,7 +45,7 @@ from benchmarks.faulty import (  # noqa: E402
 )
 from benchmarks.faulty.cases import Case, Outcome, Place  # noqa: E402
 
-GROUPS = [commands, values, captures, photographs, splats, formats, masks, deletions]
+GROUPS = [commands, values, captures, photographs, splats, formats, masks, fits, deletions]
 GROUPS += [priors, pairs, resumes, folders, processes]
 CASES: list[Case] = [case for group in GROUPS for case in group.CASES]
 SHOWN = 240  # characters of a message in the table

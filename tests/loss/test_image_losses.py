@@ -40,6 +40,17 @@ def test_without_ssim_it_is_l1():
     assert photometric_loss(a, b, 0).item() == pytest.approx(0.25)
 
 
+@pytest.mark.parametrize("size", [(2, 17, 23, 3), (1, 3, 4, 3), (1, 1, 1, 1)])
+def test_the_loss_on_the_cpu_is_that_of_the_map_and_so_is_its_gradient(size):
+    rng = torch.Generator().manual_seed(2)
+    a, b = (torch.rand(size, dtype=torch.float64, generator=rng) for _ in range(2))
+    a.requires_grad_()
+    loss = photometric_loss(a, b, 0.3)
+    slow = 0.7 * (a - b).abs().mean() + 0.3 * (1 - ssim_map(a, b).mean())
+    assert loss.item() == pytest.approx(slow.item(), abs=1e-12)
+    torch.testing.assert_close(*(torch.autograd.grad(value, a)[0] for value in (loss, slow)), atol=1e-12, rtol=1e-9)
+
+
 def test_gradient():
     generator = torch.Generator().manual_seed(1)
     a = torch.rand(1, 5, 6, 3, dtype=torch.float64, generator=generator, requires_grad=True)

@@ -34,6 +34,10 @@ class CaptureOptions:
 
     format: str | None = field(default=None, metadata={"choices": FORMATS})  # None: whichever finds its files
     images: str = "images"  # folder of the photographs in a COLMAP capture
+    masks: str = (
+        ""  # folder of pictures, <photograph>.png each, black where a fit leaves its photograph out; empty: those
+    )
+    # that the capture names itself (nerfstudio's mask_path)
     downscale: Annotated[float, Range("[1, inf)")] = 1.0  # photographs are made smaller by this factor, at least 1
     width: Side | None = None  # pixels; with height: centred crop to their aspect, then resize
     height: Side | None = None  # pixels; width or height alone: the other follows the photograph's aspect
@@ -64,12 +68,13 @@ class Points(NamedTuple):
 @dataclass(frozen=True)
 class Shot:
     """What a format says of one photograph. viewmat [4,4] float64 world to camera, OpenCV axes; lens as calibrated,
-    which may be at another size than the file; path None: there is no photograph."""
+    which may be at another size than the file; path None: there is no photograph. mask: what counts of it, if named."""
 
     name: str
     viewmat: np.ndarray
     lens: Lens
     path: Path | None
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)

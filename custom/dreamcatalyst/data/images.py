@@ -26,7 +26,8 @@ class Photo:
     """A photograph and the part of it that a view shows.
 
     lens: what it was taken with, at the file's own size. window: left, top, width, height in pixels of the undistorted
-    photograph. width, height: the size to which the window is resized.
+    photograph. width, height: the size to which the window is resized. mask: a picture of the same size, black where
+    the photograph is to be left out of a fit.
     """
 
     path: Path
@@ -34,16 +35,37 @@ class Photo:
     window: tuple[int, int, int, int]
     width: int
     height: int
+    mask: Path | None = None
 
     def load(self, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
         """Decode, lay over `background` (RGB in [0,1]) where transparent, undistort, crop, resize: uint8 [H,W,3].
 
         Shrinking averages over areas. Raises DataError where the file cannot be decoded or has changed its size.
         """
-        image = decode(self.path, background)
+        return self._placed(decode(self.path, background), self.path)
+
+    def load_alpha(self) -> np.ndarray | None:
+        """How opaque the photograph is, uint8 [H,W]; None for a file without alpha, such as a JPEG."""
+        image = _read(self.path)
+        if image.ndim != 3 or image.shape[2] != 4:
+            return None
+        return self._placed(np.ascontiguousarray(image[..., 3]), self.path)
+
+    def load_mask(self) -> np.ndarray | None:
+        """What counts of the photograph, bool [H,W]: pixels of which half at least are not black in the mask; None
+        where there is no mask. Raises DataError for one that cannot be read or has another size."""
+        if self.mask is None:
+            return None
+        image = _read(self.mask)
+        kept = image > 0 if image.ndim == 2 else (image[..., :3] > 0).any(axis=2)
+        return self._placed(kept.astype(np.uint8) * 255, self.mask) >= 128
+
+    def _placed(self, image: np.ndarray, path: Path) -> np.ndarray:
+        """A picture in the file's pixels, read from `path`, as the view shows it."""
         if image.shape[:2] != (self.lens.height, self.lens.width):
-            size = f"{image.shape[1]}x{image.shape[0]}"
-            raise DataError(f"{self.path}: decodes to {size}, its header said {self.lens.width}x{self.lens.height}")
+            size, expected = f"{image.shape[1]}x{image.shape[0]}", f"{self.lens.width}x{self.lens.height}"
+            said = f"its header said {expected}" if path == self.path else f"its photograph is {expected}"
+            raise DataError(f"{path}: decodes to {size}, {said}")
         left, top, width, height = self.window
         image = undistort(image, self.lens)[top : top + height, left : left + width]
         if (width, height) != (self.width, self.height):
@@ -87,8 +109,8 @@ def _any_size() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = before
 
 
-def decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
-    """RGB uint8 [H,W,3] of an image file as stored: 8 or 16 bits, grey, colour or with alpha."""
+def _read(path: Path) -> np.ndarray:
+    """uint8 [H,W] or [H,W,BGR or BGRA] of an image file as stored, of 8 or 16 bits."""
     try:
         image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error) as error:
@@ -99,6 +121,12 @@ def decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
         image = (image / 257).round().astype(np.uint8)
     if image.dtype != np.uint8:
         raise DataError(f"{path}: has pixels of type {image.dtype}, expected 8 or 16 bits")
+    return image
+
+
+def decode(path: Path, background: tuple[float, float, float]) -> np.ndarray:
+    """RGB uint8 [H,W,3] of an image file as stored: grey, colour or with alpha."""
+    image = _read(path)
     if image.ndim == 2:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     rgb = np.ascontiguousarray(image[..., 2::-1])

@@ -14,6 +14,7 @@ from .camera import Cameras
 from .formats import FORMATS, CaptureOptions, Format, Points, Shot
 from .images import Photo, image_size, there
 from .lens import Lens
+from .masks import masked
 from .origin import ZERO, Origin, far_origin
 from .sizes import fit, require_memory
 from .transforms import splats_from_capture
@@ -37,10 +38,11 @@ def open_capture(source: str | Path, options: CaptureOptions = DEFAULTS) -> Capt
         raise DataError(f"{path}: is an empty reconstruction: no photograph has a camera. Reconstruct it again")
     shots = sorted(scan.shots, key=lambda shot: shot.name)
     _check(path, shots)
+    shots, masks = masked(shots, options.masks, Path(source))
     shots, points, origin = _recentred(shots, scan.points)
     views = [_view(shot, options) for shot in shots]
     train, test = split(len(views), options, path)
-    notices = tuple(scan.notices)
+    notices = (*scan.notices, *masks)
     capture = Capture(path, views, train, test, points, notices, options, origin, scan.scene, scan.truths)
     if not options.dataparser:
         return capture
@@ -130,7 +132,7 @@ def _view(shot: Shot, options: CaptureOptions) -> View:
     except DataError as error:
         raise DataError(f"'{shot.name}': {error}") from error
     camera = Cameras(viewmat[None], K[None], lens.width, lens.height).cropped(*window).resized(width, height)
-    photo = None if shot.path is None else Photo(shot.path, lens, window, width, height)
+    photo = None if shot.path is None else Photo(shot.path, lens, window, width, height, shot.mask)
     return View(shot.name, camera.to(dtype=torch.float32), photo)
 
 

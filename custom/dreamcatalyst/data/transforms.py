@@ -88,7 +88,11 @@ def _shot(path: Path, meta: dict, index: int, frame: object) -> Shot:
     photo = _photo(path.parent / frame["file_path"])
     camera_to_world = _matrix(frame["transform_matrix"], f"{where}, transform_matrix") @ OPENGL_TO_OPENCV
     name = Path(frame["file_path"]).as_posix()
-    return Shot(name, np.linalg.inv(camera_to_world), _lens({**meta, **frame}, where, photo), photo)
+    mask = frame.get("mask_path")
+    if mask is not None and (not isinstance(mask, str) or "\0" in mask):
+        raise DataError(f"{where}: 'mask_path' is {mask!r}, expected the path of a mask")
+    beside = None if mask is None else path.parent / mask
+    return Shot(name, np.linalg.inv(camera_to_world), _lens({**meta, **frame}, where, photo), photo, beside)
 
 
 def _photo(path: Path) -> Path:

@@ -95,6 +95,23 @@ class Capture:
             return self._renders[index]
         return torch.from_numpy(self._cache.get(index)).float() / 255
 
+    @property
+    def has_masks(self) -> bool:
+        """Whether a part of some photograph is to be left out of fits."""
+        return any(view.photo is not None and view.photo.mask is not None for view in self.views)
+
+    def kept(self, index: int) -> Tensor | None:
+        """What counts of a photograph in a fit, [H,W,1] of 0 and 1; None: all of it. Raises DataError."""
+        photo = self.views[index].photo
+        mask = None if photo is None else photo.load_mask()
+        return None if mask is None else torch.from_numpy(mask).float()[..., None]
+
+    def alpha(self, index: int) -> Tensor | None:
+        """How opaque a photograph is, [H,W,1] in [0,1]; None: its file says nothing of it. Raises DataError."""
+        photo = self.views[index].photo
+        alpha = None if photo is None else photo.load_alpha()
+        return None if alpha is None else torch.from_numpy(alpha).float()[..., None] / 255
+
     def prefetch(self, indices: Iterable[int]) -> None:
         """Begin to load these photographs in the background, as many as fit in options.resident_gib."""
         if self.scene is None and self.has_photos:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -39,11 +41,55 @@ def ssim_map(a: Float[Tensor, "B H W C"], b: Float[Tensor, "B H W C"]) -> Float[
     return (top / ((mx * mx + my * my + SSIM_C1) * (vx + vy + SSIM_C2))).permute(0, 2, 3, 1)
 
 
+class _SsimToTarget(torch.autograd.Function):
+    """`ssim_map` on the CPU against a target that has no gradient: OpenCV's filter and the derivative in closed form,
+    which take a sixth of the time of convolutions that torch differentiates."""
+
+    @staticmethod
+    def forward(ctx, render: Tensor, target: Tensor) -> Tensor:
+        x, y = render.detach(), target
+        mx, my, xx, yy, xy = map(_filter, (x, y, x * x, y * y, x * y))
+        product = mx * my
+        means, spreads = mx * mx + my * my + SSIM_C1, xx + yy + (SSIM_C1 + SSIM_C2)
+        spreads -= means  # of the two variances
+        near, along = 2 * product + SSIM_C1, 2 * (xy - product) + SSIM_C2
+        below = 1 / (means * spreads)
+        ssim = near * along * below
+        ctx.save_for_backward(x, y, mx, my, ssim, near * below, along * below, means, spreads)
+        return ssim
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        x, y, mx, my, ssim, near, along, means, spreads = ctx.saved_tensors
+        by_xx, by_xy = grad * ssim / spreads, grad * near  # of xx with its sign turned, and half of xy
+        by_mean = grad * (my * along - mx * ssim / means) + mx * by_xx - my * by_xy  # half of it
+        return 2 * (_filter(by_mean) - x * _filter(by_xx) + y * _filter(by_xy)), None
+
+
+def _filter(maps: Tensor) -> Tensor:
+    """`_blur` of [B,H,W,C] on the CPU."""
+    window = _window(maps.dtype, maps.device).numpy()
+    done = [cv2.sepFilter2D(m, -1, window, window, borderType=cv2.BORDER_CONSTANT) for m in maps.contiguous().numpy()]
+    return torch.from_numpy(np.stack(done)).reshape(maps.shape)
+
+
 def photometric_loss(
-    render: Float[Tensor, "B H W C"], target: Float[Tensor, "B H W C"], ssim_weight: float = 0.2
+    render: Float[Tensor, "B H W C"],
+    target: Float[Tensor, "B H W C"],
+    ssim_weight: float = 0.2,
+    kept: Float[Tensor, "B H W 1"] | None = None,
 ) -> Float[Tensor, ""]:
-    """(1 - w) L1 + w (1 - SSIM), a scalar. render, target [B,H,W,3]. Source: Kerbl et al. 2023, equation 7, w = 0.2."""
+    """(1 - w) L1 + w (1 - SSIM), a scalar. render, target [B,H,W,3]. Source: Kerbl et al. 2023, equation 7, w = 0.2.
+
+    kept [B,H,W,1] of 0 and 1: the pixels over which it is the mean; the others are black in both pictures.
+    """
+    share: Tensor | float = 1.0
+    if kept is not None:
+        render, target = render * kept, target * kept
+        share = kept.mean().clamp_min(1 / kept.numel())
     l1 = (render - target).abs().mean()
     if ssim_weight == 0:
-        return l1
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(render, target).mean())
+        return l1 / share
+    embedded = render.device.type == "cpu" and not target.requires_grad
+    similarity = _SsimToTarget.apply(render, target) if embedded else ssim_map(render, target)
+    return ((1 - ssim_weight) * l1 + ssim_weight * (1 - similarity.mean())) / share

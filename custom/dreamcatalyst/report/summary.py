@@ -25,6 +25,7 @@ LABELS = {  # of the tiles, the best first, by score
     "psnr_truth": "PSNR to the truth, dB",
     "psnr_edit_inside": "PSNR to the known edit, inside, dB",
     "psnr_edit": "PSNR to the known edit, dB",
+    "psnr_photo_inside": "PSNR to the photographs, where masks count them, dB",
     "psnr_photo": "PSNR to the photographs, dB",
     "ssim_photo": "SSIM to the photographs",
     "l1_source_outside": "drift outside of the mask, L1",

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from torch import Tensor
+
 from ..config import BelowOne, Between, Count, Fraction, NonNegative, parse
 from ..registry import Registry
 from ..render.api import Render
@@ -15,13 +17,14 @@ from ..scene.trainable import Splats
 
 DENSITY = Registry("density strategy", __package__)
 DENSITY.add("adaptive", ".densify:Adaptive")
+DENSITY.add("mcmc", ".mcmc:Mcmc")
 
 
 @dataclass(frozen=True)
 class DensifyConfig:
     """When and how the number of splats changes. Steps count optimizer steps; lengths are fractions of the extent."""
 
-    strategy: str = "adaptive"  # a name of DENSITY; adaptive: 3DGS's with GaussianEditor's top fraction
+    strategy: str = "adaptive"  # a name of DENSITY; adaptive: 3DGS's with GaussianEditor's top fraction | mcmc
     options: dict = field(default_factory=dict)  # a strategy's own; those of adaptive stand below
     every: Count = 100  # steps between two densifications; 0: never
     start: Count = 500  # first step at which splats may be added
@@ -67,8 +70,8 @@ class Moment:
 
 
 class Density:
-    """A strategy of density control. Its order: begin, then in each step observe (after backward) and after_step (after
-    the optimizer's update).
+    """A strategy of density control. Its order: begin, then in each step terms (of the loss), observe (after backward)
+    and after_step (after the optimizer's update).
 
     Config: its own options. states: names of its per-splat tensors in `splats.state`, which move with the splats and
     are kept in checkpoints; `begin` makes them.
@@ -85,6 +88,10 @@ class Density:
 
     def begin(self, splats: Splats) -> None:
         """Make the per-splat state."""
+
+    def terms(self, splats: Splats) -> dict[str, Tensor]:
+        """What the strategy adds to the loss of a step, by name."""
+        return {}
 
     def observe(self, splats: Splats, render: Render, loss_scale: float = 1.0) -> None:
         """Look at a step's gradients. loss_scale: what the loss was multiplied by before backward."""

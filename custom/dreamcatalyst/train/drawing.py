@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from torch import device
+from torch import Tensor, device
 
 from ..config import Colour, Count
 from ..data.camera import Cameras
@@ -41,14 +41,14 @@ class Drawer:
         self.config, self.clock = config, clock
         self._frozen: tuple[Gaussians | None, Frozen | None] = None, None
 
-    def __call__(self, scene: Gaussians, cameras: Cameras, **options: Any) -> Render:
-        """Render V views. options: further ones of `rasterize`."""
+    def __call__(self, scene: Gaussians, cameras: Cameras, background: Tensor | None = None, **options: Any) -> Render:
+        """Render V views. background [3]: another one than the run's. options: further ones of `rasterize`."""
         config = self.config
         with self.clock.stage("render"):
             return rasterize(
                 scene,
                 cameras,
-                background=scene.means.new_tensor(config.background),
+                background=scene.means.new_tensor(config.background) if background is None else background,
                 antialiased=config.antialiased,
                 backend=config.backend,
                 **options,

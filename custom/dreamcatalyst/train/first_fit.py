@@ -24,7 +24,7 @@ from ..data.views import Capture, View
 from ..errors import ConfigError
 from ..files import file_digest, write_text
 from ..report.summary import FIT
-from ..resume import MAY_CHANGE, contents, recipe
+from ..resume import MAY_CHANGE, contents, read_checkpoint, recipe
 from ..scene.fitted import downscale_for
 from .datamodule import SplatData
 from .edit_config import FirstFitConfig
@@ -83,32 +83,54 @@ class FirstFit:
         return self.folder / "save" / RESULT
 
     @property
-    def done(self) -> bool:
-        """Whether it has come to its end."""
-        return self.result.is_file() and (self.folder / FIT).is_file()
+    def told(self) -> dict[str, Any]:
+        """How it went, by what it left; empty where it has not come to its end, or its splats have changed since."""
+        path = self.folder / FIT
+        told: dict[str, Any] = {}
+        try:
+            told = json.loads(path.read_text(encoding="utf-8"))
+            whole = told["digest"] == file_digest(self.result)
+        except FileNotFoundError:
+            return {}
+        except (ValueError, TypeError, KeyError):
+            whole = False
+        if not whole:
+            plugin.warn(f"{self.folder}: what is kept of the fit is damaged, so it is fitted again")
+            path.unlink()
+            return {}
+        return told
 
     @property
     def checkpoint(self) -> Path:
         """Where an interrupted one left off."""
         return self.folder / "ckpts" / "last.ckpt"
 
-    def clear(self) -> None:
-        """Take away what an interrupted one left that cannot be gone on from."""
-        if self.folder.is_dir() and not self.checkpoint.is_file():
+    def begin(self) -> int:
+        """The step from which it goes on, 0 for a new one. What cannot be gone on from is taken away, and said."""
+        if self.checkpoint.is_file():
+            try:
+                step = read_checkpoint(self.checkpoint, to_train=True)["global_step"]
+            except ConfigError as error:
+                plugin.warn(f"{error} It is fitted anew")
+            else:
+                self.merged.resume = str(self.checkpoint)
+                return step
+        if self.folder.is_dir():
             shutil.rmtree(self.folder)
+        return 0
 
     def finish(self) -> None:
         """Write down how it went, and let go of what only training needs."""
         summary = json.loads((self.folder / "report" / "summary.json").read_text(encoding="utf-8"))
         told = {"steps": self.steps, "seconds": summary["seconds"], "splats": summary["splats"], **summary["mean"]}
+        told["digest"] = file_digest(self.result)
         write_text(self.folder / FIT, json.dumps({"source": str(self.source), **told}, indent=2) + "\n")
         shutil.rmtree(self.folder / "ckpts", ignore_errors=True)
 
-    @property
-    def text(self) -> str:
+    def text(self, told: Mapping[str, Any]) -> str:
         """How it went, in words."""
-        told = json.loads((self.folder / FIT).read_text(encoding="utf-8"))
-        score = f", {told['psnr_photo']:.2f} dB at held-out views" if told.get("psnr_photo") is not None else ""
+        psnr = told.get("psnr_photo_inside", told.get("psnr_photo"))
+        score = "" if psnr is None else f", {psnr:.2f} dB at held-out views"
         what = f"{told['splats']:,} splats after {told['steps']:,} steps in {told['seconds']:,.0f} s{score}"
         return f"splats fitted to the photographs of {self.source}: {what}; kept in {self.folder}"
 
@@ -158,7 +180,8 @@ def _content(capture: Capture) -> list[Any]:
 
     def of(view: View) -> list[Any]:
         camera, photo = view.camera, view.photo
-        seen = None if photo is None else (photo.lens, photo.window, file_digest(photo.path))
+        files = [] if photo is None else [file_digest(path) for path in (photo.path, photo.mask) if path is not None]
+        seen = [] if photo is None else [photo.lens, photo.window, photo.mask is None, *files]
         return [view.name, camera.viewmats, camera.Ks, camera.width, camera.height, seen]
 
     with ThreadPoolExecutor() as pool:

@@ -98,6 +98,7 @@ class SplatSystem(MeasuredSystem):
         """One update of the splats, and its numbers. Raises NumericalError, and leaves the splats as they were."""
         method, scaler = self.method, self._scaler
         terms, render, numbers = method.step_loss(batch, step)
+        terms |= method.density.terms(method.splats)
         update = Updater(
             method.splats,
             method.density,
