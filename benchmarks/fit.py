@@ -1,10 +1,10 @@
 """How good a fit is after how long: time from launch to the last step, and PSNR at held-out views.
 
-Each length is a run of configs/fit.yaml in a process of its own, since the time counts from launch: imports, photographs
-and the plan are in it, the scoring of the result is not. The renderer's kernels are compiled before, which happens once
-after an installation. The bound is a fit of ten times the longest run's steps.
+Each length is a run of configs/fit.yaml in a process of its own, since the time counts from launch: imports,
+photographs and the plan are in it, the scoring of the result is not. The renderer's kernels are compiled before, which
+happens once after an installation. The bound is a fit of ten times the longest run's steps.
 
-python benchmarks/fit.py --capture <folder> [--steps 1000 5000] [--bound] [--options] [key=value ...]
+python benchmarks/fit.py --capture <folder> [--steps 1200 6000] [--bound] [--options] [key=value ...]
 --options compares exposures, sampling and coarse steps with the config as it is, at the first length.
 """
 
@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LENGTHS = (1000, 6000)
+LENGTHS = (1200, 6000)
 OPTIONS = {
     "as it is": [],
     "exposures": ["system.exposure=0.002"],
