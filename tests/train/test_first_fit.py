@@ -53,10 +53,9 @@ def test_a_kept_fit_that_was_damaged_is_fitted_again(capture, launch, capsys):
     launch("closed-form.yaml", *words(capture), mode="--test")
     splats = fits()[0] / "save/last.ply"
     whole = splats.read_bytes()
-    for spoilt in (whole[:-1], b"ply"):
-        splats.write_bytes(spoilt)
-        launch("closed-form.yaml", *words(capture), mode="--test")
-        assert "is damaged, so it is fitted again" in capsys.readouterr().err and splats.read_bytes() == whole
+    splats.write_bytes(whole[:-1])
+    launch("closed-form.yaml", *words(capture), mode="--test")
+    assert "is damaged, so it is fitted again" in capsys.readouterr().err and splats.read_bytes() == whole
 
 
 def test_other_photographs_or_another_recipe_are_another_fit(capture, launch):

@@ -78,3 +78,20 @@ def test_a_resumed_fit_has_the_bits_of_one_that_was_not_interrupted(capture, lau
     (whole / "save/last.ply").unlink()
     launch("fit.yaml", *given, f"resume={half}")
     assert (whole / "save/last.ply").read_bytes() == bits
+
+
+def test_what_words_name_is_left_out_with_what_the_mask_leaves_out(capture, launch, monkeypatch, tmp_path):
+    from dreamcatalyst.train.fit import FitMethod
+
+    from tests.segment.small_models import make_clipseg
+
+    masks(capture / "masks")
+    model, found = make_clipseg(tmp_path / "clipseg"), {}
+    find = FitMethod._find_kept
+    monkeypatch.setattr(FitMethod, "_find_kept", lambda self, i: found.setdefault(i, (self, find(self, i)))[1])
+    words = f"system.leave_out={{text: person. sky, path: {model}, threshold: 0.5}}"
+    launch("fit.yaml", f"data.source={capture}", "data.masks=masks", words, *BRIEF)
+    for index, (method, kept) in found.items():
+        named = method.finder(method.photo(index))
+        assert torch.equal(kept[..., 0], (1 - named) * method.capture.kept(index)[..., 0])
+    assert len(found) > 4
