@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -40,7 +42,7 @@ class HealConfig:
     tolerance: Fraction = 0.02  # of its depth by which a point may lie behind what a view shows and is seen by it
     slack: Fraction = 0.25  # and of its distance to the thing: what is far behind it is hidden by it in few views
     border: Fraction = 0.015  # width around a hole that the thing has tinted: filled anew in pictures
-    smallest: Fraction = 0.001  # area of a hole that is filled, a fraction of the picture; smaller ones are noise
+    smallest: Fraction = 0.001  # area of a hole that is filled, a fraction of the picture; smaller parts are noise
     share: Fraction = 0.3  # part of what is seen of a splat that lies in holes and their borders; it may change then
 
 
@@ -152,7 +154,7 @@ class Healing:
         slack = slack + config.slack * distances_to(self.scene.means[self.thing], there)
         hole = changed & (drawn.alpha[0, ..., 0] < HALF)
         hole[changed] |= ~seen(there, normals, self.views, slack)
-        return opened(hole)
+        return large_parts(opened(hole), config.smallest)
 
     def fill_views(self, rest: Gaussians, holes: Mapping[int, Tensor]) -> tuple[dict[int, Tensor], Gaussians]:
         """Pictures without holes by view, and the splats [A] of their surfaces: the view with the largest hole first,
@@ -162,14 +164,15 @@ class Healing:
         while left:
             view = max(left, key=lambda v: float(left[v].float().mean()))
             hole = left.pop(view)
-            if float(hole.float().mean()) < self.healer.config.smallest:
+            if not bool(hole.any()):
                 break
             drawn = self.healer.draw(Gaussians.cat([rest, new]), self.healer.cameras[view], depth=True)
             pictures[view], more = self.fill(drawn, hole, view)
             new = Gaussians.cat([new, more])
             for other in left:
                 if bool(left[other].any()):
-                    left[other] = opened(left[other] & ~self.covered(rest, new, other))
+                    open_still = opened(left[other] & ~self.covered(rest, new, other))
+                    left[other] = large_parts(open_still, self.healer.config.smallest)
         return pictures, new
 
     def fill(self, drawn: Render, hole: Tensor, view: int) -> tuple[Tensor, Gaussians]:
@@ -206,3 +209,13 @@ def widened(mask: Bool[Tensor, "H W"], pixels: int) -> Bool[Tensor, "H W"]:
 def opened(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     """The mask without what is narrower than three pixels: the noise of depths along outlines."""
     return widened(~widened(~mask, 1), 1) & mask
+
+
+def large_parts(mask: Bool[Tensor, "H W"], smallest: float) -> Bool[Tensor, "H W"]:
+    """The connected parts of a mask whose area is at least `smallest`, a fraction of the picture."""
+    from scipy import ndimage
+
+    parts = cast(tuple[np.ndarray, int], ndimage.label(mask.cpu().numpy()))[0]
+    areas = np.bincount(parts.ravel())
+    areas[0] = 0  # what is no part
+    return torch.from_numpy((areas >= max(1, smallest * parts.size))[parts]).to(mask.device)
