@@ -5,7 +5,7 @@ never by its rows; what comes is compared with renders of the world without it, 
 training view of the world shows: pixels whose point in the world without the thing is hidden in all of them. Views that
 the fit itself gets wrong (under 25 dB before anything is taken away) are counted, and left out of the means.
 
-python benchmarks/delete.py [--worlds statue ...] [--inpaint telea ...] [--steps 1500] [--folder outputs/deletions]
+python benchmarks/delete.py [--worlds statue ...] [--inpaint fsr ...] [--steps 1500] [--folder outputs/deletions]
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def unchanged(before: Gaussians, after: Gaussians) -> bool:
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", nargs="+", default=list(CASES), choices=list(CASES), metavar="WORLD")
-    parser.add_argument("--inpaint", nargs="+", default=["telea"], metavar="KIND")
+    parser.add_argument("--inpaint", nargs="+", default=["fsr"], metavar="KIND")
     parser.add_argument("--steps", type=int, default=1500, help="of the fits")
     parser.add_argument("--folder", type=Path, default=Path("outputs/deletions"))
     args = parser.parse_args(argv)

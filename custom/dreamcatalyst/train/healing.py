@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..config import AtLeastOne, Fraction
+from ..config import AtLeastOne, Fraction, NonNegative
 from ..data.camera import Cameras
 from ..errors import SceneError
 from ..inpaint.depth import continue_depth
@@ -43,6 +43,7 @@ class HealConfig:
     slack: Fraction = 0.25  # and of its distance to the thing: what is far behind it is hidden by it in few views
     border: Fraction = 0.015  # width around a hole that the thing has tinted: filled anew in pictures
     smallest: Fraction = 0.001  # area of a hole that is filled, a fraction of the picture; smaller parts are noise
+    reach: NonNegative = 0.5  # times the thing's size: what goes on farther from it than that is noise, too
     share: Fraction = 0.3  # part of what is seen of a splat that lies in holes and their borders; it may change then
 
 
@@ -92,11 +93,11 @@ class Healer:
         return max(1, round(length * max(camera.width, camera.height)))
 
     def evidence(self, scene: Gaussians, masks: Mapping[int, Tensor]) -> Evidence:
-        """What is seen of each splat, and how much of that inside of masks [H,W], over all views."""
+        """What is seen of each splat, and how much of that inside of masks [H,W], over the views that have one."""
         found, config = Evidence(*scene.means.new_zeros(2, len(scene))), self.draw.config
-        for view, camera in self.cameras.items():
-            mask = [masks[view].to(scene.means)]
-            found += lift(scene, camera, mask, backend=config.backend, antialiased=config.antialiased)
+        for view, mask in masks.items():
+            given = scene, self.cameras[view], [mask.to(scene.means)]
+            found += lift(*given, backend=config.backend, antialiased=config.antialiased)
         return found
 
 
@@ -104,7 +105,7 @@ class Healing:
     """One scene's healing, step by step. before: views' depths with the thing; changed: where they showed it."""
 
     def __init__(self, healer: Healer, scene: Gaussians, thing: Tensor):
-        self.healer, self.scene, self.thing = healer, scene, thing
+        self.healer, self.scene, self.thing, self.means = healer, scene, thing, scene.means[thing]
         self.before: dict[int, Tensor] = {}
         self.changed: dict[int, Tensor] = {}
         for view, camera in healer.cameras.items():
@@ -118,6 +119,7 @@ class Healing:
         rest = rest[~unseen]
         holes = {view: self.hole(rest, view) for view in self.healer.cameras}
         pictures, new = self.fill_views(rest, holes)
+        holes = {view: holes[view] for view in pictures}
         border = self.border(rest, holes)
         added = new.means.new_ones(len(new), dtype=torch.bool)
         return Healed(
@@ -127,7 +129,7 @@ class Healing:
             unseen=int(unseen.sum()),
             added=len(new),
             pictures=pictures,
-            holes={view: holes[view] for view in pictures},
+            holes=holes,
         )
 
     def unjudged(self, rest: Gaussians) -> Bool[Tensor, " R"]:
@@ -151,14 +153,14 @@ class Healing:
         points = surface_points(camera, drawn.depth[0, ..., 0])
         normals, there = surface_normals(camera, points)[changed], points[changed]
         slack = config.tolerance * drawn.depth[0, ..., 0][changed]
-        slack = slack + config.slack * distances_to(self.scene.means[self.thing], there)
+        slack = slack + config.slack * distances_to(self.means, there)
         hole = changed & (drawn.alpha[0, ..., 0] < HALF)
         hole[changed] |= ~seen(there, normals, self.views, slack)
         return large_parts(opened(hole), config.smallest)
 
-    def fill_views(self, rest: Gaussians, holes: Mapping[int, Tensor]) -> tuple[dict[int, Tensor], Gaussians]:
+    def fill_views(self, rest: Gaussians, holes: dict[int, Tensor]) -> tuple[dict[int, Tensor], Gaussians]:
         """Pictures without holes by view, and the splats [A] of their surfaces: the view with the largest hole first,
-        and then those in which enough of theirs is left."""
+        and then those in which enough of theirs is left. `holes` are narrowed to what was filled."""
         left, pictures, new = dict(holes), {}, rest[:0]
         new = new.map(torch.clone)
         while left:
@@ -167,7 +169,11 @@ class Healing:
             if not bool(hole.any()):
                 break
             drawn = self.healer.draw(Gaussians.cat([rest, new]), self.healer.cameras[view], depth=True)
-            pictures[view], more = self.fill(drawn, hole, view)
+            hole, surface = self.surface(drawn, hole, view)
+            if not bool(hole.any()):
+                continue
+            holes[view] = hole
+            pictures[view], more = self.fill(drawn, hole, surface, view)
             new = Gaussians.cat([new, more])
             for other in left:
                 if bool(left[other].any()):
@@ -175,14 +181,20 @@ class Healing:
                     left[other] = large_parts(open_still, self.healer.config.smallest)
         return pictures, new
 
-    def fill(self, drawn: Render, hole: Tensor, view: int) -> tuple[Tensor, Gaussians]:
-        """One view's picture without its hole, and splats that show it. drawn: the view as it is."""
-        healer, rgb, depth = self.healer, drawn.rgb[0].clamp(0, 1), drawn.depth[0, ..., 0]
-        width = healer.pixels(healer.config.border, view)
-        wide = widened(hole, width)
-        picture = healer.fill(rgb, wide)
-        surface = continue_depth(depth, wide, 2 * width)
-        splats = surface_splats(healer.cameras[view], surface, picture, widened(hole, 1), self.scene.sh_degree)
+    def surface(self, drawn: Render, hole: Tensor, view: int) -> tuple[Tensor, Tensor]:
+        """Those parts of a hole [H,W] that are closed near the thing, and the depth [H,W] that closes them."""
+        healer, width = self.healer, self.healer.pixels(self.healer.config.border, view)
+        depth = continue_depth(drawn.depth[0, ..., 0], widened(hole, width), 2 * width)
+        away = torch.full_like(depth, torch.inf)
+        away[hole] = distances_to(self.means, surface_points(healer.cameras[view], depth)[hole])
+        size = (self.means.amax(dim=0) - self.means.amin(dim=0)).max()
+        return large_parts(hole & (away <= healer.config.reach * size), healer.config.smallest), depth
+
+    def fill(self, drawn: Render, hole: Tensor, depth: Tensor, view: int) -> tuple[Tensor, Gaussians]:
+        """One view's picture without its hole, and splats at `depth` that show it. drawn: the view as it is."""
+        healer, rgb = self.healer, drawn.rgb[0].clamp(0, 1)
+        picture = healer.fill(rgb, widened(hole, healer.pixels(healer.config.border, view)))
+        splats = surface_splats(healer.cameras[view], depth, picture, widened(hole, 1), self.scene.sh_degree)
         extra = {name: value.new_zeros(len(splats), *value.shape[1:]) for name, value in self.scene.extra.items()}
         return picture, splats.with_extra(**extra)
 
@@ -193,7 +205,7 @@ class Healing:
         return drawn.features[0, ..., 0] > HALF
 
     def border(self, rest: Gaussians, holes: Mapping[int, Tensor]) -> Bool[Tensor, " R"]:
-        """Splats that are seen in holes and around them, and hardly elsewhere."""
+        """Splats of which much is seen in holes and around them, by the views that were filled."""
         healer = self.healer
         around = {view: widened(hole, healer.pixels(2 * healer.config.border, view)) for view, hole in holes.items()}
         found = healer.evidence(rest, around)
