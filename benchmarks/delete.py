@@ -11,6 +11,7 @@ python benchmarks/delete.py [--worlds statue ...] [--inpaint fsr ...] [--steps 1
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 import time
 from dataclasses import dataclass
@@ -196,6 +197,7 @@ def deletion(name: str, inpaint: str, folder: Path, steps: int) -> tuple[Scores,
     world, capture = make_world(name), open_capture(f"demo:{name}", CaptureOptions(max_side=256))
     splats, tag = fitted(name, folder, steps), f"{name.replace(':', '-')}-{inpaint}"
     mask = mask_options(world, capture, thing, kind, folder / "masks" / name.replace(":", "-"))
+    shutil.rmtree(folder / "delete" / tag, ignore_errors=True)
     began = time.perf_counter()
     given = [f"data.source=demo:{name}", f"system.gs_source={splats}", f"system.thing={thing}"]
     run("delete", folder, tag, *given, f"system.mask={mask}", f"system.inpaint.kind={inpaint}")

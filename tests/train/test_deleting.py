@@ -16,7 +16,7 @@ from dreamcatalyst.train.healing import HealConfig, Healer, opened
 
 BOX = {"low": [-0.32, -0.37, 0.03], "high": [0.45, 0.37, 1.15]}  # of configs/delete.yaml
 SIZE = 48
-SMALL = ["trainer.max_steps=2", "data.width=48", "data.height=48", "system.heal.views=6"]
+SMALL = ["trainer.max_steps=2", "system.mask.grow=0", "data.width=48", "data.height=48", "system.heal.views=6"]
 GREEN, RED = torch.tensor([0.2, 0.6, 0.3]), torch.tensor([0.9, 0.1, 0.1])
 
 
