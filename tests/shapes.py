@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
-from beartype import BeartypeConf, beartype
+from beartype import BeartypeConf, BeartypeHintOverrides, beartype
 from jaxtyping import install_import_hook
+from omegaconf import DictConfig
 
 ROOT = Path(__file__).resolve().parent.parent / "custom"
 COMPILED = re.compile(r"^from numba import|^@njit|^@kernel", re.MULTILINE)  # numba cannot compile a checked function
 
-FOLDERS = ("data", "scene", "render", "loss")  # those whose annotations hold
-checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int may stand for a float
+FOLDERS = ("data", "scene", "render", "diffusion", "guidance", "loss")  # those whose annotations hold
+# An int may stand for a float, and a section of OmegaConf for a dict, as in its own structured configs.
+_beartype = beartype(
+    conf=BeartypeConf(is_pep484_tower=True, hint_overrides=BeartypeHintOverrides({dict: dict | DictConfig}))
+)
+
+
+def checked(function: Callable) -> Callable:
+    """With its annotations checked; a function inside another, which is made anew at each call, as it is."""
+    return function if "<locals>" in function.__qualname__ else _beartype(function)
 
 
 def checked_modules() -> list[str]:

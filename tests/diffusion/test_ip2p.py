@@ -340,6 +340,7 @@ def test_tiny_autoencoder_of_another_model_is_refused(models, tmp_path):
         InstructPix2Pix(Ip2pConfig(str(models["ip2p"]), autoencoder=str(path)))
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_images_of_another_layout_are_refused(prior):
     with pytest.raises(PriorError, match=r"shape \(1, 64, 64, 3\) cannot be encoded; expected \[B,3,H,W\]"):
         prior.encode(torch.rand(1, 64, 64, 3))
@@ -448,6 +449,7 @@ def test_a_long_prompt_warns_with_the_lost_words(prior):
         torch.testing.assert_close(long, prior.embed(["fox " * 75])[0])
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_prompt_that_is_no_text_is_refused(prior):
     with pytest.raises(PriorError, match="prompt None is of type NoneType, expected text"):
         prior.embed([None])

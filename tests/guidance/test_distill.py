@@ -100,7 +100,7 @@ def test_loss_of_the_mean_does_not_depend_on_resolution():
 
 def test_unknown_reduction():
     with pytest.raises(ConfigError, match="mean, sum"):
-        distillation_loss(torch.zeros(1), torch.zeros(1), "median")
+        distillation_loss(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1), "median")
 
 
 # --- refusals
@@ -113,6 +113,7 @@ def test_numbers_that_are_not_finite_are_found_with_their_timestep(world):
         gradient(world, world.prior, get_rule("dreamcatalyst"), x=x)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_shapes_must_agree(world):
     with pytest.raises(PriorError, match="noise"):
         gradient(world, world.prior, get_rule("dreamcatalyst"), noise=world.noise[:1])

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -42,12 +43,14 @@ class Autoencoder:
         self.vae.enable_gradient_checkpointing()
         self.vae.encoder.train()  # older diffusers checkpoint in training mode only; it changes nothing else here
 
-    def encode(self, images: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Images [B,3,H,W] in [0,1] to scaled latents [B,C,ceil(H/factor),ceil(W/factor)], differentiable.
+    def encode(
+        self, images: Float[Tensor, "B 3 H W"], noise: Float[Tensor, "#B C h w"] | None = None
+    ) -> Float[Tensor, "B C h w"]:
+        """Images in [0,1] to scaled latents, differentiable; h = ceil(H/factor), w = ceil(W/factor).
 
-        The posterior's mode; or, where `sample` is set, mean + std * noise. noise [B,C,h,w] or [1,C,h,w], standard
-        normal: where it is not given, one draw from `seed` is used for every image of that size, so that the latents of
-        a source and of its edit share it, however often they are encoded.
+        The posterior's mode; or, where `sample` is set, mean + std * noise. noise, standard normal: where it is not
+        given, one draw from `seed` is used for every image of that size, so that the latents of a source and of its
+        edit share it, however often they are encoded.
         """
         pixels = self._pixels(images)
         half = pixels.requires_grad and self.vae.dtype.itemsize == 2
@@ -57,36 +60,40 @@ class Autoencoder:
         return scaled
 
     @torch.no_grad()
-    def condition(self, images: Tensor) -> Tensor:
-        """The posterior's mode of images [B,3,H,W] in [0,1], unscaled, in the model's precision, without graph.
+    def condition(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:
+        """The posterior's mode of images in [0,1], unscaled, in the model's precision, without graph.
         unit_condition: of these numbers as they are, not brought to [-1,1]."""
         pixels = self._pixels(images)
         encoded = self.vae.encode((pixels / 2 + 0.5 if self.unit_condition else pixels).to(self.vae.dtype))
         return encoded.latents / self.scale + self.shift if self.tiny else encoded.latent_dist.mode()
 
     @torch.no_grad()
-    def deviation(self, images: Tensor) -> Tensor:
-        """The posterior's standard deviation of images [B,3,H,W] in [0,1], in units of scaled latents, without graph;
+    def deviation(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:
+        """The posterior's standard deviation of images in [0,1], in units of scaled latents, without graph;
         not for a tiny autoencoder."""
         posterior = self.vae.encode(self._pixels(images).to(self.vae.dtype)).latent_dist
         return (posterior.std * self.scale).to(images.dtype)
 
     @torch.no_grad()
-    def decode(self, latents: Tensor, size: tuple[int, int] | None = None) -> Tensor:
-        """Scaled latents [B,C,h,w] to images [B,3,h*factor,w*factor] in [0,1], or their upper left `size` (H, W)."""
+    def decode(
+        self, latents: Float[Tensor, "B C h w"], size: tuple[int, int] | None = None
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Scaled latents to images in [0,1], H = h*factor and W = w*factor; or their upper left `size` (H, W)."""
         z = latents if self.tiny else latents / self.scale + self.shift
         images = self.vae.decode(z.to(self.vae.dtype)).sample.to(latents.dtype)
         height, width = size or images.shape[-2:]
         return (images[..., :height, :width] / 2 + 0.5).clamp(0, 1)
 
-    def _pixels(self, images: Tensor) -> Tensor:
+    def _pixels(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 padded_H padded_W"]:
         """[0,1] to [-1,1], padded to whole latents."""
         if images.ndim != 4 or images.shape[1] != 3:
             raise PriorError(f"images of shape {tuple(images.shape)} cannot be encoded; expected [B,3,H,W] in [0,1]")
         height, width = images.shape[-2:]
         return F.pad(images * 2 - 1, (0, -width % self.factor, 0, -height % self.factor), mode="replicate")
 
-    def _scaled(self, pixels: Tensor, noise: Tensor | None) -> Tensor:
+    def _scaled(
+        self, pixels: Float[Tensor, "B 3 H W"], noise: Float[Tensor, "#B C h w"] | None
+    ) -> Float[Tensor, "B C h w"]:
         encoded = self._encoder(pixels.to(self.vae.dtype))
         if self.tiny:
             return encoded.latents
@@ -96,12 +103,12 @@ class Autoencoder:
             z = z + posterior.std * (self._shared_noise(z) if noise is None else noise).to(z)
         return (z - self.shift) * self.scale
 
-    def _shared_noise(self, z: Tensor) -> Tensor:
+    def _shared_noise(self, z: Float[Tensor, "B C h w"]) -> Float[Tensor, "1 C h w"]:
         generator = torch.Generator().manual_seed(self.seed)
         return torch.randn((1, *z.shape[1:]), generator=generator)
 
 
-def _keep_gradient_in_range(inside: Tensor, outside: Tensor) -> None:
+def _keep_gradient_in_range(inside: Float[Tensor, "B 3 H W"], outside: Float[Tensor, "B C h w"]) -> None:
     """Carry a gradient through a half-precision encoder at full range, whatever the loss's reduction.
 
     What arrives at `outside` is divided by the power of two below its largest element, and what comes back at `inside`

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from ..config import Number, Positive
 from ..errors import PriorError
 from .api import Prior, Row
 from .noise import abar_at, stable_diffusion_schedule
-from .operators import Operator, find_operator
+from .operators import Instruction, Operator, find_operator
 
 Form = TypeVar("Form", bound="ClosedForm")
 
@@ -34,22 +35,26 @@ class ClosedFormConfig:
 class SourceImage:
     """The condition: B images as latents, and what each operator makes of them, computed once."""
 
-    def __init__(self, latents: Tensor):
+    def __init__(self, latents: Float[Tensor, "B 3 H W"]):
         self.latents = latents
         self._edited: dict[str, Tensor] = {}
         self._known: Tensor | None = None
 
-    def assume(self, latents: Tensor) -> None:
-        """Take `latents` [B,3,H,W] for what any instruction makes of the images."""
+    def assume(self, latents: Float[Tensor, "B 3 H W"]) -> None:
+        """Take `latents` for what any instruction makes of the images."""
         self._known = latents
 
-    def edited(self, operator: Operator) -> Tensor:
-        """T(image) as latents [B,3,H,W]."""
+    def edited(self, instruction: Instruction) -> Float[Tensor, "B 3 H W"]:
+        """T(image) as latents. Raises PriorError where the instruction says nothing of images."""
         if self._known is not None:
             return self._known
-        if operator.name not in self._edited:
-            self._edited[operator.name] = 2.0 * operator((self.latents + 1.0) / 2.0) - 1.0
-        return self._edited[operator.name]
+        if not isinstance(instruction, Operator):
+            raise PriorError(
+                f"'{instruction.name}' names no operation on images, and what it makes of this is not known"
+            )
+        if instruction.name not in self._edited:
+            self._edited[instruction.name] = 2.0 * instruction((self.latents + 1.0) / 2.0) - 1.0
+        return self._edited[instruction.name]
 
     @staticmethod
     def cat(parts: Sequence[SourceImage]) -> SourceImage:
@@ -77,28 +82,30 @@ class ClosedForm(Prior):
         self,
         config: ClosedFormConfig | None = None,
         device: torch.device | str = "cpu",
-        alphas_cumprod: Tensor | None = None,
+        alphas_cumprod: Float64[Tensor, " T"] | None = None,
     ):
-        """device: any, there are no weights to place; alphas_cumprod [T]: Stable Diffusion's where none is given."""
+        """device: any, there are no weights to place; alphas_cumprod: Stable Diffusion's where none is given."""
         self.config = config or ClosedFormConfig()
         self.alphas_cumprod = stable_diffusion_schedule() if alphas_cumprod is None else alphas_cumprod
 
-    def encode(self, images: Tensor, noise: Tensor | None = None) -> Tensor:
+    def encode(
+        self, images: Float[Tensor, "B 3 H W"], noise: Float[Tensor, "B 3 H W"] | None = None
+    ) -> Float[Tensor, "B 3 H W"]:
         return 2.0 * images - 1.0
 
     @torch.no_grad()
-    def decode(self, latents: Tensor) -> Tensor:
+    def decode(self, latents: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
         return ((latents + 1.0) / 2.0).clamp(0.0, 1.0)
 
     @torch.no_grad()
-    def condition(self, images: Tensor) -> SourceImage:
+    def condition(self, images: Float[Tensor, "B 3 H W"]) -> SourceImage:
         return SourceImage(self.encode(images))
 
     def stack(self, conditions: Sequence[SourceImage]) -> SourceImage:
         return SourceImage.cat(conditions)
 
     @torch.no_grad()
-    def known_edit(self, condition: SourceImage, text: Operator | None) -> Tensor:
+    def known_edit(self, condition: SourceImage, text: Instruction | None) -> Float[Tensor, "B 3 H W"]:
         return self.decode(condition.latents if text is None else condition.edited(text))
 
     def with_spread(self: Form, spread: float) -> Form:
@@ -121,7 +128,7 @@ class ClosedForm(Prior):
         return self.config.s, s_image, s_null
 
     @torch.no_grad()
-    def predict_noise(self, rows: Sequence[Row], timestep: int) -> list[Tensor]:
+    def predict_noise(self, rows: Sequence[Row], timestep: int) -> list[Float[Tensor, "B 3 H W"]]:
         """E[eps | x_t] = k_v (x_t - sqrt(abar) m), of each row's mean m and spread v; k_v is `noise_slope`."""
         abar = abar_at(self.alphas_cumprod, timestep)
         out = []
@@ -131,7 +138,7 @@ class ClosedForm(Prior):
             out.append(slope * (row.noisy - abar**0.5 * mean))
         return out
 
-    def _moments(self, row: Row) -> tuple[Tensor | float, float]:
+    def _moments(self, row: Row) -> tuple[Float[Tensor, "B 3 H W"] | float, float]:
         s, s_image, s_null = self.spreads()
         if row.image is None and row.text is not None:
             raise PriorError(f"closed-form: the instruction '{row.text.name}' has no image to act on")

@@ -7,6 +7,7 @@ from itertools import accumulate
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import PriorError
@@ -17,11 +18,11 @@ from .api import Prior, Row
 class Branch:
     """One guided noise prediction: noisy latents, what guides them, and how strongly.
 
-    noisy [B,C,h,w]; text: from `Prior.embed`, None for the null instruction; image: from `Prior.condition`;
+    text: from `Prior.embed`, None for the null instruction; image: from `Prior.condition`;
     guidance_scale w_y, image_guidance_scale w_I: 1 is no amplification, w_y = 0 leaves the text out.
     """
 
-    noisy: Tensor
+    noisy: Float[Tensor, "B C h w"]
     text: Any
     image: Any
     guidance_scale: float
@@ -64,8 +65,8 @@ def difference_rows(edit: Branch, reference: Branch | None = None, takes_image: 
 
 
 @torch.no_grad()
-def predict_difference(prior: Prior, edit: Branch, reference: Branch | None, timestep: int) -> Tensor:
-    """eps_edit - eps_reference (eps_edit where there is no reference), [B,C,h,w], without graph.
+def predict_difference(prior: Prior, edit: Branch, reference: Branch | None, timestep: int) -> Float[Tensor, "B C h w"]:
+    """eps_edit - eps_reference (eps_edit where there is no reference), without graph.
 
     One call of the prior for all rows, none where no row is left. The sum is taken in float32, in float64 where the
     latents are.
@@ -85,7 +86,7 @@ def predict_difference(prior: Prior, edit: Branch, reference: Branch | None, tim
     return total
 
 
-def _weighted_sum(parts: list[tuple[Tensor, float]]) -> Tensor:
+def _weighted_sum(parts: list[tuple[Float[Tensor, "B C h w"], float]]) -> Float[Tensor, "B C h w"]:
     """sum c_i p_i as c_1 (p_1 - p_2) + (c_1 + c_2) (p_2 - p_3) + ... + (c_1 + ... + c_n) p_n: of a branch, w_y times
     what the text changes, w_I times what the image changes, and the null prediction. The c_i themselves grow with w_y
     and cancel, which would cost the digits that a large guidance scale amplifies."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import torch
+from jaxtyping import Float64
 from torch import Tensor, nn
 
 from ..errors import PriorError
@@ -74,8 +75,8 @@ class Folder:
             raise PriorError(f"{file}: expected a list of wordings for each edit. Download the folder again.")
         return taught
 
-    def alphas_cumprod(self) -> Tensor:
-        """abar_t [T] float64. The betas are the folder's (float32, as trained); their product is taken in float64,
+    def alphas_cumprod(self) -> Float64[Tensor, " T"]:
+        """abar_t. The betas are the folder's (float32, as trained); their product is taken in float64,
         because rules that divide by 1 - abar_t / abar_{t-1} would see the rounding of a float32 product."""
         from diffusers import DDPMScheduler
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..config import NonNegative
@@ -75,8 +76,8 @@ def _decoder(unet: Any) -> Iterator[Site]:
             backbone = resnet.out_channels
 
 
-def filter_low_frequencies(x: Tensor, scale: float) -> Tensor:
-    """Multiply the 2x2 block of lowest frequencies of x [B,C,h,w] by `scale`.
+def filter_low_frequencies(x: Float[Tensor, "B C h w"], scale: float) -> Float[Tensor, "B C h w"]:
+    """Multiply the 2x2 block of lowest frequencies of x by `scale`.
 
     The block is the four coefficients around the centre of the shifted spectrum, frequencies {-1, 0} per axis, and the
     real part of the result is kept, as in the paper's code. Seven real basis functions span what these coefficients
@@ -88,8 +89,8 @@ def filter_low_frequencies(x: Tensor, scale: float) -> Tensor:
     return torch.add(flat, low, alpha=scale - 1).view(x.shape).to(x.dtype)
 
 
-def _low_frequency_basis(h: int, w: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """[h*w, n] with x -> x @ basis @ basis.T the real part of the projection onto frequencies {-1, 0} x {-1, 0}."""
+def _low_frequency_basis(h: int, w: int, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "{h}*{w} n"]:
+    """n vectors with x -> x @ basis @ basis.T the real part of the projection onto frequencies {-1, 0} x {-1, 0}."""
 
     def phases(n: int) -> list[Tensor]:
         angle = torch.arange(n, device=device, dtype=dtype) * (2 * math.pi / n)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..config import AtLeastOne, Seed
@@ -145,30 +146,34 @@ class LatentDiffusion(Prior):
 
     # -- images and latents -------------------------------------------------------------------------------------------
 
-    def encode(self, images: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Images [B,3,H,W] in [0,1] to scaled latents [B,C,ceil(H/8),ceil(W/8)], differentiable in `images`.
+    def encode(
+        self, images: Float[Tensor, "B 3 H W"], noise: Float[Tensor, "B C h w"] | None = None
+    ) -> Float[Tensor, "B C h w"]:
+        """Images in [0,1] to scaled latents, differentiable in `images`; h = ceil(H/8), w = ceil(W/8).
 
-        noise [B,C,h,w], standard normal: draw from the posterior with it, whatever `latents` says.
+        noise, standard normal: draw from the posterior with it, whatever `latents` says.
         """
         with self._own_precision():
             return self.autoencoder.encode(images, noise)
 
-    def latent_shape(self, images: Tensor) -> tuple[int, ...]:
+    def latent_shape(self, images: Float[Tensor, "B 3 H W"]) -> tuple[int, ...]:
         height, width = (-(-side // self.autoencoder.factor) for side in images.shape[-2:])
         return self.latent_channels, height, width
 
-    def deviation(self, images: Tensor) -> Tensor:
+    def deviation(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:
         with self._own_precision():
             return self.autoencoder.deviation(images)
 
-    def decode(self, latents: Tensor, size: tuple[int, int] | None = None) -> Tensor:
-        """Scaled latents [B,C,h,w] to images [B,3,8h,8w] in [0,1], without graph. size (H, W): of the image that was
+    def decode(
+        self, latents: Float[Tensor, "B C h w"], size: tuple[int, int] | None = None
+    ) -> Float[Tensor, "B 3 H W"]:
+        """Scaled latents to images in [0,1], without graph; H = 8h, W = 8w. size (H, W): of the image that was
         encoded, where its sides are no multiple of 8; the surplus on the right and at the bottom is cut off."""
         with self._own_precision():
             return self.autoencoder.decode(latents, size)
 
-    def condition(self, images: Tensor) -> Tensor | None:
-        """The image condition of images [B,3,H,W] in [0,1]: the posterior's mode [B,C,h,w], unscaled, without graph;
+    def condition(self, images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"] | None:
+        """The image condition of images in [0,1]: the posterior's mode, unscaled, without graph;
         None for a prior that takes no image."""
         if not self.takes_image:
             return None
@@ -177,8 +182,8 @@ class LatentDiffusion(Prior):
 
     # -- text ---------------------------------------------------------------------------------------------------------
 
-    def embed(self, prompts: Sequence[str]) -> list[Tensor]:
-        """One text embedding [L,D] per prompt, without graph. The text encoder runs once for each distinct prompt.
+    def embed(self, prompts: Sequence[str]) -> list[Float[Tensor, "L D"]]:
+        """One text embedding per prompt, without graph. The text encoder runs once for each distinct prompt.
 
         Warns with the words that are lost where a prompt is longer than the encoder takes (77 tokens).
         """
@@ -189,7 +194,7 @@ class LatentDiffusion(Prior):
                 self._embeddings[prompt] = self._encode_text(prompt)
         return [self._embeddings[prompt] for prompt in prompts]
 
-    def _encode_text(self, prompt: str) -> Tensor:
+    def _encode_text(self, prompt: str) -> Float[Tensor, "L D"]:
         length = min(self.tokenizer.model_max_length, self.max_tokens)
         ids = self.tokenizer(prompt, verbose=False).input_ids
         if len(ids) > length:  # the first and the last token are the marks of start and end
@@ -201,8 +206,8 @@ class LatentDiffusion(Prior):
 
     # -- noise --------------------------------------------------------------------------------------------------------
 
-    def predict_noise(self, rows: Sequence[Row], timestep: int) -> list[Tensor]:
-        """The noise in each row's `noisy` [B,C,h,w] at index `timestep` (0..T-1), without graph, in one U-Net call.
+    def predict_noise(self, rows: Sequence[Row], timestep: int) -> list[Float[Tensor, "B C h w"]]:
+        """The noise in each row's `noisy` at index `timestep` (0..T-1), without graph, in one U-Net call.
 
         Row.text: an embedding [L,D] (or [B,L,D] from elsewhere), None for the empty prompt. Row.image: [B,C,h,w] from
         `condition`, None for zeros, as InstructPix2Pix was trained without an image. Whatever the model predicts
@@ -238,7 +243,7 @@ class LatentDiffusion(Prior):
                     f"the prompt with this prior, or with a text encoder of that width."
                 )
 
-    def _input(self, row: Row) -> Tensor:
+    def _input(self, row: Row) -> Float[Tensor, "B channels h w"]:
         """The U-Net's channels of one row in its precision."""
         noisy = row.noisy.to(self.device, self.dtype)
         if not self.takes_image:
@@ -246,12 +251,14 @@ class LatentDiffusion(Prior):
         image = torch.zeros_like(noisy) if row.image is None else row.image.to(noisy)
         return torch.cat([noisy, image], dim=1)
 
-    def _text(self, row: Row) -> Tensor:
+    def _text(self, row: Row) -> Float[Tensor, "B L D"]:
         text = self.null_text if row.text is None else row.text
         text = self.embed([""])[0] if text is None else text.to(self.device, self.dtype)
         return text.expand(len(row.noisy), -1, -1)
 
-    def _call_unet(self, inputs: Tensor, text: Tensor, timestep: int) -> Tensor:
+    def _call_unet(
+        self, inputs: Float[Tensor, "N channels h w"], text: Float[Tensor, "N L D"], timestep: int
+    ) -> Float[Tensor, "N C h w"]:
         """The U-Net on N images, at most `max_rows` at a time; half as many from then on whenever memory runs out."""
         t = torch.tensor(timestep, device=self.device)
         done: list[Tensor] = []
@@ -281,7 +288,9 @@ class LatentDiffusion(Prior):
             )
         self.max_rows = (rows + 1) // 2
 
-    def _to_noise(self, predicted: Tensor, noisy: Tensor, timestep: int) -> Tensor:
+    def _to_noise(
+        self, predicted: Float[Tensor, "N C h w"], noisy: Float[Tensor, "N C h w"], timestep: int
+    ) -> Float[Tensor, "N C h w"]:
         """What the model predicts as the noise in x_t = sqrt(abar) x_0 + sqrt(1 - abar) eps."""
         signal, sigma = self.alphas_cumprod[timestep].sqrt().item(), (1 - self.alphas_cumprod[timestep]).sqrt().item()
         if self.prediction_type == "v_prediction":  # v = sqrt(abar) eps - sqrt(1 - abar) x_0

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from ..errors import PriorError
@@ -15,20 +16,22 @@ from ..errors import PriorError
 # alphas_cumprod[t]    bar alpha_{t+1}
 
 
-def stable_diffusion_schedule(steps: int = 1000, beta_start: float = 0.00085, beta_end: float = 0.012) -> Tensor:
-    """alphas_cumprod [steps] float64 of Stable Diffusion: beta is linear in its square root (Rombach et al. 2022)."""
+def stable_diffusion_schedule(
+    steps: int = 1000, beta_start: float = 0.00085, beta_end: float = 0.012
+) -> Float64[Tensor, " {steps}"]:
+    """alphas_cumprod of Stable Diffusion: beta is linear in its square root (Rombach et al. 2022)."""
     betas = torch.linspace(beta_start**0.5, beta_end**0.5, steps, dtype=torch.float64) ** 2
     return torch.cumprod(1.0 - betas, dim=0)
 
 
-def abar_at(alphas_cumprod: Tensor, timestep: int) -> float:
+def abar_at(alphas_cumprod: Float[Tensor, " T"], timestep: int) -> float:
     """alphas_cumprod at index `timestep` as a number. Raises PriorError outside 0..T-1, where indexing would wrap."""
     if not 0 <= timestep < len(alphas_cumprod):
         raise PriorError(f"timestep {timestep} is outside the prior's schedule: 0..{len(alphas_cumprod) - 1}")
     return float(alphas_cumprod[timestep])
 
 
-def signal_at(alphas_cumprod: Tensor, timestep: int) -> float:
+def signal_at(alphas_cumprod: Float[Tensor, " T"], timestep: int) -> float:
     """As `abar_at`, for those who divide by it. Raises PriorError where it is 0: with zero terminal SNR (Lin et al.
     2024), the last noisy latents hold nothing of the image, and a noise prediction says nothing about it."""
     abar = abar_at(alphas_cumprod, timestep)
@@ -40,8 +43,8 @@ def signal_at(alphas_cumprod: Tensor, timestep: int) -> float:
     return abar
 
 
-def add_noise(latents: Tensor, noise: Tensor, abar: float) -> Tensor:
-    """x_t = sqrt(abar) x_0 + sqrt(1 - abar) eps (Ho et al. 2020, equation 4), all of one shape."""
+def add_noise(latents: Float[Tensor, "*shape"], noise: Float[Tensor, "*shape"], abar: float) -> Float[Tensor, "*shape"]:
+    """x_t = sqrt(abar) x_0 + sqrt(1 - abar) eps (Ho et al. 2020, equation 4)."""
     return abar**0.5 * latents + (1.0 - abar) ** 0.5 * noise
 
 
@@ -60,7 +63,7 @@ def keyed_noise(
     shape: Sequence[int],
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
-) -> Tensor:
+) -> Float[Tensor, ...]:
     """Standard normal noise of `shape`, a pure function of (seed, step, view).
 
     It is drawn on the CPU in float32 whatever the device and precision, so that a run gives the same noise on every

@@ -13,24 +13,19 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import PriorError
 from .closed_form import ClosedForm, SourceImage
+from .operators import Instruction
 
 
 @dataclass
 class Source:
-    """Where the truth comes from. image: number of a view to the edited scene there, [H,W,3] in [0,1]."""
+    """Where the truth comes from. image: number of a view to the edited scene there, in [0,1]."""
 
-    image: Callable[[int], Tensor] | None = None
-
-
-@dataclass(frozen=True)
-class Instruction:
-    """A text that is not empty; whatever it says, it asks for the edit whose truth the prior was told."""
-
-    name: str
+    image: Callable[[int], Float[Tensor, "H W 3"]] | None = None
 
 
 class WorldTruth(ClosedForm):
@@ -43,7 +38,7 @@ class WorldTruth(ClosedForm):
         super().__init__(*args, **kwargs)
         self.truth = Source()  # shared by the copies that `with_spread` makes
 
-    def tell_truth(self, image: Callable[[int], Tensor]) -> None:
+    def tell_truth(self, image: Callable[[int], Float[Tensor, "H W 3"]]) -> None:
         self.truth.image = image
 
     def with_spread(self, spread: float) -> WorldTruth:
@@ -52,11 +47,11 @@ class WorldTruth(ClosedForm):
         return other
 
     def embed(self, prompts: Sequence[str]) -> list[Instruction | None]:
-        """Any instruction; None, the identity, for an empty one."""
+        """Any instruction: it asks for the edit whose truth the prior was told. None, the identity, for an empty one."""
         return [_instruction(prompt) if prompt.strip() else None for prompt in prompts]
 
     @torch.no_grad()
-    def condition_of(self, images: Tensor, view: int) -> SourceImage:
+    def condition_of(self, images: Float[Tensor, "B 3 H W"], view: int) -> SourceImage:
         if self.truth.image is None:
             raise PriorError(
                 "world-truth: there is no edited scene to look at. This prior is for made worlds whose edit is known: "

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..diffusion.api import Prior
@@ -39,13 +40,15 @@ class Comparison(Objective):
         return with_wide_spread(self.prompted.closed_form)
 
     @abstractmethod
-    def target(self, render: Tensor, source: Tensor, view: int, step: int) -> Tensor:
-        """The picture [H,W,3] in [0,1] that stands for `view` at `step`."""
+    def target(
+        self, render: Float[Tensor, "H W 3"], source: Float[Tensor, "H W 3"], view: int, step: int
+    ) -> Float[Tensor, "H W 3"]:
+        """The picture in [0,1] that stands for `view` at `step`."""
 
     def step(
         self,
-        rgb: Tensor,
-        sources: Tensor,
+        rgb: Float[Tensor, "B H W 3"],
+        sources: Float[Tensor, "B H W 3"],
         index: Sequence[int],
         step: int,
         max_steps: int,
@@ -59,10 +62,14 @@ class Comparison(Objective):
 class KnownEdit(Comparison):
     """The edit itself, where the prior knows it: what a method can reach at best."""
 
-    def target(self, render: Tensor, source: Tensor, view: int, step: int) -> Tensor:
+    def target(
+        self, render: Float[Tensor, "H W 3"], source: Float[Tensor, "H W 3"], view: int, step: int
+    ) -> Float[Tensor, "H W 3"]:
         return exact_edit(self.prompted, source, view, self.prompted.text)
 
-    def picture(self, render: Tensor, source: Tensor, index: int, step: int) -> Tensor:
+    def picture(
+        self, render: Float[Tensor, "H W 3"], source: Float[Tensor, "H W 3"], index: int, step: int
+    ) -> Float[Tensor, "H W 3"]:
         return self.target(render, source, index, step)
 
 
@@ -84,19 +91,25 @@ class DatasetUpdate(Comparison):
     @property
     def picture_rows(self) -> int:
         at = self.prompted
-        rows = difference_rows(Branch(torch.zeros(1), at.text, object(), *at.scales), None, at.prior.takes_image)
+        rows = difference_rows(
+            Branch(torch.zeros(1, 1, 1, 1), at.text, object(), *at.scales), None, at.prior.takes_image
+        )
         return len(rows) * at.config.diffusion_steps
 
-    def target(self, render: Tensor, source: Tensor, view: int, step: int) -> Tensor:
+    def target(
+        self, render: Float[Tensor, "H W 3"], source: Float[Tensor, "H W 3"], view: int, step: int
+    ) -> Float[Tensor, "H W 3"]:
         if self.edited.due(view, step):
             with self.prompted.stage("unet"):
                 self.edited.put(view, self.picture(render, source, view, step))
         return self.edited.get(view, like=render)
 
     @torch.no_grad()
-    def picture(self, render: Tensor, source: Tensor, index: int, step: int) -> Tensor:
-        """The prior's edit of a render [H,W,3], noised to a level that is drawn, and conditioned on the source render
-        of the view: [H,W,3] in [0,1]."""
+    def picture(
+        self, render: Float[Tensor, "H W 3"], source: Float[Tensor, "H W 3"], index: int, step: int
+    ) -> Float[Tensor, "H W 3"]:
+        """The prior's edit of a render, noised to a level that is drawn, and conditioned on the source render
+        of the view; in [0,1]."""
         at = self.prompted
         latents = at.encode(render[None], [index], step)
         timestep = self.edited.timestep(index, step, len(at.prior.alphas_cumprod))

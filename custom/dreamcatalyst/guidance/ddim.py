@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..diffusion.api import Prior
@@ -31,7 +32,7 @@ def ddim_timesteps(first: int, steps: int) -> list[int]:
 @torch.no_grad()
 def denoise(
     prior: Prior,
-    noisy: Tensor,
+    noisy: Float[Tensor, "B C h w"],
     timesteps: Sequence[int],
     *,
     image: Any,
@@ -39,10 +40,10 @@ def denoise(
     guidance_scale: float,
     image_guidance_scale: float,
     set_alpha_to_one: bool = True,
-) -> Tensor:
-    """Deterministic DDIM (Song et al. 2021, equation 12, eta = 0) along `timesteps` to clean latents, [B,C,h,w].
+) -> Float[Tensor, "B C h w"]:
+    """Deterministic DDIM (Song et al. 2021, equation 12, eta = 0) along `timesteps` to clean latents.
 
-    noisy [B,C,h,w]: latents at the noise level of timesteps[0]. set_alpha_to_one (as diffusers calls it): end at abar
+    noisy: latents at the noise level of timesteps[0]. set_alpha_to_one (as diffusers calls it): end at abar
     = 1, without noise; else at that of timestep 0, as Stable Diffusion's scheduler is configured.
     Raises PriorError at a level without signal.
     """
@@ -60,8 +61,8 @@ def denoise(
 @torch.no_grad()
 def edit_image(
     prior: Prior,
-    latents: Tensor | None,
-    noise: Tensor,
+    latents: Float[Tensor, "B C h w"] | None,
+    noise: Float[Tensor, "B C h w"],
     *,
     image: Any,
     text: Any,
@@ -70,11 +71,11 @@ def edit_image(
     guidance_scale: float = 7.5,
     image_guidance_scale: float = 1.5,
     set_alpha_to_one: bool = True,
-) -> Tensor:
-    """The prior's edit, as latents [B,C,h,w]: of `latents` noised to `timestep` (Haque et al. 2023), or, where there
+) -> Float[Tensor, "B C h w"]:
+    """The prior's edit, as latents: of `latents` noised to `timestep` (Haque et al. 2023), or, where there
     are none, from `noise` alone at the prior's last timestep (Brooks et al. 2023).
 
-    noise [B,C,h,w] standard normal; image, text: conditions. steps: of DDIM, fewer where there are not as many
+    noise: standard normal; image, text: conditions. steps: of DDIM, fewer where there are not as many
     timesteps. set_alpha_to_one: see `denoise`.
     """
     first = len(prior.alphas_cumprod) - 1 if timestep is None else timestep
@@ -95,18 +96,18 @@ def edit_image(
 def sample_rule(
     prior: Prior,
     rule: Rule,
-    x_src: Tensor,
+    x_src: Float[Tensor, "B C h w"],
     timesteps: Sequence[int],
-    noise: Callable[[int], Tensor],
+    noise: Callable[[int], Float[Tensor, "B C h w"]],
     *,
-    start: Tensor | None = None,
+    start: Float[Tensor, "B C h w"] | None = None,
     **conditions: Any,
-) -> Tensor:
-    """A gradient rule as a sampler on latents [B,C,h,w], from `start` (the source latents x_src where None):
+) -> Float[Tensor, "B C h w"]:
+    """A gradient rule as a sampler on latents, from `start` (the source latents x_src where None):
 
     x <- x - sqrt(1-abar)/sqrt(abar) [(eps_edit - eps_ref) + (b/a) (x - x_src)] at each of `timesteps`, high to low.
     Without the second term this is DreamCatalyst's equation 13, where eps_ref reproduces the noise.
-    noise(i): the noise of step i (from 0), [B,C,h,w]. conditions: those of distillation_gradient (image, text, scales).
+    noise(i): the noise of step i (from 0). conditions: those of distillation_gradient (image, text, scales).
     Whether the steps shrink an error is known on the closed form: fixed_point.contraction.
     """
     x = x_src if start is None else start

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..diffusion.api import Prior
@@ -18,22 +19,22 @@ from .rules import EDIT_NULL, NOISE, SOURCE, SOURCE_NULL, Replacement, Rule
 def distillation_gradient(
     prior: Prior,
     rule: Rule,
-    x: Tensor,
-    x_src: Tensor | None,
+    x: Float[Tensor, "B C h w"],
+    x_src: Float[Tensor, "B C h w"] | None,
     *,
     image: Any,
     text: Any,
     timestep: int,
-    noise: Tensor,
+    noise: Float[Tensor, "B C h w"],
     source_text: Any = None,
     guidance_scale: float = 7.5,
     image_guidance_scale: float = 1.5,
-) -> Tensor:
-    """g = a(t) (eps_edit - eps_ref) + b(t) (x - x_src) on latents, [B,C,h,w], without graph.
+) -> Float[Tensor, "B C h w"]:
+    """g = a(t) (eps_edit - eps_ref) + b(t) (x - x_src) on latents, without graph.
 
-    x, x_src [B,C,h,w]: latents of the edited and of the source render (x_src may be None for a rule without source).
+    x, x_src: latents of the edited and of the source render (x_src may be None for a rule without source).
     image: `prior.condition` of the source; text, source_text: from `prior.embed`, None for the null instruction
-    (source_text is used by dds and pds). timestep: index 0..T-1. noise: as x, the same for both branches.
+    (source_text is used by dds and pds). timestep: index 0..T-1. noise: the same for both branches.
     The result is float32, float64 where x is. Half-precision latents are noised in float32: at high noise all that x
     and x_src differ by is below the last digit of a half-precision x_t.
     A step with a(t) = 0 does not call the prior. Raises ConfigError where the rule lacks its source,
@@ -64,13 +65,20 @@ def network_rows(
     prior: Prior, rule: Rule, text: Any, source_text: Any, guidance_scale: float, image_guidance_scale: float
 ) -> int:
     """How many rows one step of the rule asks of the prior for each view."""
-    latents, other = torch.zeros(1), torch.zeros(1)
+    latents, other = torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1)
     edit = Branch(latents, text, object(), guidance_scale, image_guidance_scale)
-    reference = _reference(rule, edit, other, torch.zeros(1), 0.5, source_text)
+    reference = _reference(rule, edit, other, torch.zeros(1, 1, 1, 1), 0.5, source_text)
     return len(difference_rows(edit, reference, prior.takes_image))
 
 
-def _reference(rule: Rule, edit: Branch, x_src: Tensor, noise: Tensor, abar: float, source_text: Any) -> Branch | None:
+def _reference(
+    rule: Rule,
+    edit: Branch,
+    x_src: Float[Tensor, "B C h w"],
+    noise: Float[Tensor, "B C h w"],
+    abar: float,
+    source_text: Any,
+) -> Branch | None:
     """The branch of eps_ref, None where it is the injected noise."""
     scales = (edit.guidance_scale, edit.image_guidance_scale)
     if rule.reference == EDIT_NULL:
@@ -82,7 +90,9 @@ def _reference(rule: Rule, edit: Branch, x_src: Tensor, noise: Tensor, abar: flo
     return None
 
 
-def distillation_loss(x: Tensor, gradient: Tensor, reduction: str = "mean") -> Tensor:
+def distillation_loss(
+    x: Float[Tensor, "B C h w"], gradient: Float[Tensor, "B C h w"], reduction: str = "mean"
+) -> Float[Tensor, ""]:
     """0.5 * mean of (x - stopgrad(x - g))^2, whose gradient in x is g divided by the number of elements of x.
 
     reduction "mean": the balance against other losses does not change with resolution. "sum": the sum divided by the
@@ -105,7 +115,13 @@ def check_prior(rule: Rule | Replacement, prior: Prior) -> None:
         )
 
 
-def _check_latents(rule: Rule, x: Tensor, x_src: Tensor | None, noise: Tensor, b: float) -> None:
+def _check_latents(
+    rule: Rule,
+    x: Float[Tensor, "B C h w"],
+    x_src: Float[Tensor, "B C h w"] | None,
+    noise: Float[Tensor, "B C h w"],
+    b: float,
+) -> None:
     if x_src is None and (b != 0.0 or rule.reference in (SOURCE, SOURCE_NULL)):
         raise ConfigError(f"rule '{rule.name}' needs the latents of the source render and got none")
     for name, other in (("x_src", x_src), ("noise", noise)):
@@ -113,7 +129,7 @@ def _check_latents(rule: Rule, x: Tensor, x_src: Tensor | None, noise: Tensor, b
             raise PriorError(f"latents x {tuple(x.shape)} and {name} {tuple(other.shape)} must have one shape")
 
 
-def _check_finite(rule: Rule, gradient: Tensor, timestep: int) -> None:
+def _check_finite(rule: Rule, gradient: Float[Tensor, "B C h w"], timestep: int) -> None:
     bad = int((~torch.isfinite(gradient)).sum())
     if bad:
         raise NumericalError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..diffusion.api import Prior
@@ -53,18 +54,20 @@ class Distillation(Objective):
         if self.prompted.prior.exact:
             check_sampler(self.prompted.closed_form, self.rule, self.sampler_timesteps, *self.prompted.scales)
 
-    def expected(self, source: Tensor, index: int, timestep: int | None = None) -> Tensor | None:
+    def expected(
+        self, source: Float[Tensor, "H W 3"], index: int, timestep: int | None = None
+    ) -> Float[Tensor, "H W 3"] | None:
         timesteps = self.resting_timesteps if timestep is None else [timestep]
         return resting_picture(self.prompted, self.rule, source, index, timesteps)
 
-    def in_balance(self, mean: Tensor, given: Step) -> Tensor:
+    def in_balance(self, mean: Float[Tensor, ""], given: Step) -> Float[Tensor, ""]:
         """As it is beside a mean, and as many times as large as the rule's loss is beside a sum."""
         return mean * given.gradient[0].numel() if self.prompted.config.reduction == "sum" else mean
 
     def step(
         self,
-        rgb: Tensor,
-        sources: Tensor | None,
+        rgb: Float[Tensor, "B H W 3"],
+        sources: Float[Tensor, "B H W 3"] | None,
         index: Sequence[int],
         step: int,
         max_steps: int,
@@ -98,8 +101,10 @@ class Distillation(Objective):
             gradient = (gradient[: len(x)] + gradient[len(x) :]) / 2
         return Step(distillation_loss(x, gradient, at.config.reduction), timestep, gradient)
 
-    def _noise(self, latents: Tensor, index: Sequence[int], step: int, visits: Sequence[int] | None) -> Tensor:
-        """The noise of a step, [B,C,h,w], or [2B,C,h,w] where it is paired. Antithetic noise cancels what is linear in
+    def _noise(
+        self, latents: Float[Tensor, "B C h w"], index: Sequence[int], step: int, visits: Sequence[int] | None
+    ) -> Float[Tensor, "rows C h w"]:
+        """The noise of a step, of B rows, or 2B where it is paired. Antithetic noise cancels what is linear in
         it: within the step at twice the rows (paired), or over two visits of a view at no cost (alternating)."""
         at, kind = self.prompted, self.prompted.config.noise
         if kind == "paired":
@@ -110,7 +115,9 @@ class Distillation(Objective):
             return torch.cat(drawn)
         return at.noise(latents, index, step)
 
-    def picture(self, render: Tensor, source: Tensor, index: int, step: int) -> Tensor:
+    def picture(
+        self, render: Float[Tensor, "H W 3"], source: Float[Tensor, "H W 3"], index: int, step: int
+    ) -> Float[Tensor, "H W 3"]:
         """The rule as a sampler from the source on, in `diffusion_steps` steps."""
         at, timesteps = self.prompted, self.sampler_timesteps
         x_src, condition = at.source_latents(source, index, step), at.encode_source(source, index)[1]

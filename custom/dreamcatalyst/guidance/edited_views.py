@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ..diffusion.noise import keyed_generator
@@ -26,7 +27,7 @@ class EditedViews:
     ):
         self.every, self.limits, self.seed = every, (lowest, highest), seed
         self.begin, self.until = begin, until
-        self._images: dict[int, Tensor] = {}
+        self._images: dict[int, UInt8[Tensor, "H W 3"]] = {}
 
     def due(self, view: int, step: int) -> bool:
         """Whether the visit of `view` at `step` makes a new edit."""
@@ -39,12 +40,12 @@ class EditedViews:
         generator = keyed_generator(self.seed, "edit", step, view)
         return int(torch.randint(low, high + 1, (1,), generator=generator))
 
-    def put(self, view: int, image: Tensor) -> None:
-        """Keep image [H,W,3] in [0,1] as the picture of `view`."""
+    def put(self, view: int, image: Float[Tensor, "H W 3"]) -> None:
+        """Keep image in [0,1] as the picture of `view`."""
         self._images[view] = (image.detach() * 255).round().to("cpu", torch.uint8)
 
-    def get(self, view: int, like: Tensor) -> Tensor:
-        """The picture of `view`, [H,W,3] in [0,1], where and in the precision that `like` is."""
+    def get(self, view: int, like: Float[Tensor, ...]) -> Float[Tensor, "H W 3"]:
+        """The picture of `view` in [0,1], where and in the precision that `like` is."""
         return self._images[view].to(like) / 255
 
     def state_dict(self) -> dict[str, Any]:

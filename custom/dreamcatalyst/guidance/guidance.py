@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import choose
@@ -45,23 +46,23 @@ class Guidance(PromptedPrior):
 
     def step(
         self,
-        rgb: Tensor,
-        sources: Tensor | None,
+        rgb: Float[Tensor, "B H W 3"],
+        sources: Float[Tensor, "B H W 3"] | None,
         index: Sequence[int],
         step: int,
         max_steps: int,
         visits: Sequence[int] | None = None,
     ) -> Step:
-        """The loss of renders rgb [B,H,W,3] of the views `index` against their source renders, at `step` of a run.
+        """The loss of renders rgb of the views `index` against their source renders, at `step` of a run.
 
-        sources [B,H,W,3]: None where prior and rule need none (sds on a text-to-image prior). visits: how often each
+        sources: None where prior and rule need none (sds on a text-to-image prior). visits: how often each
         view came before (alternating noise needs it). Noise and random timesteps are functions
         of seed, step and view. Raises NumericalError for a gradient that is not finite.
         """
         return self.objective.step(rgb, sources, index, step, max_steps, visits)
 
-    def known_edit(self, source: Tensor, index: int) -> Tensor | None:
-        """The edit that the prior knows of a view's source render, [H,W,3] in [0,1]; None for a prior that learned."""
+    def known_edit(self, source: Float[Tensor, "H W 3"], index: int) -> Float[Tensor, "H W 3"] | None:
+        """The edit that the prior knows of a view's source render, in [0,1]; None for a prior that learned."""
         return known_edit(self, source, index)
 
     # --- what a checkpoint keeps

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ..diffusion.api import Prior
@@ -16,15 +17,15 @@ from ..diffusion.api import Prior
 class Step:
     """What the guidance gives for one step.
 
-    loss: a scalar with a graph to the renders. timestep: index into the prior's schedule, -1 where the rule compares
+    loss: with a graph to the renders. timestep: index into the prior's schedule, -1 where the rule compares
     images. gradient: the rule's g on latents [B,C,h,w], or the difference of the images [B,H,W,3]; without graph.
-    target: the images [B,H,W,3] that renders are compared with, None for a rule that delivers a gradient.
+    target: the images that renders are compared with, None for a rule that delivers a gradient.
     """
 
-    loss: Tensor
+    loss: Float[Tensor, ""]
     timestep: int
-    gradient: Tensor
-    target: Tensor | None = None
+    gradient: Float[Tensor, "B ..."]
+    target: Float[Tensor, "B H W 3"] | None = None
 
     @property
     def gradient_rms(self) -> float:
@@ -46,8 +47,8 @@ class Objective(ABC):
     @abstractmethod
     def step(
         self,
-        rgb: Tensor,
-        sources: Tensor | None,
+        rgb: Float[Tensor, "B H W 3"],
+        sources: Float[Tensor, "B H W 3"] | None,
         index: Sequence[int],
         step: int,
         max_steps: int,
@@ -60,19 +61,23 @@ class Objective(ABC):
         return None
 
     @abstractmethod
-    def picture(self, render: Tensor, source: Tensor, index: int, step: int) -> Tensor:
-        """A finished picture of one view, [H,W,3] in [0,1], of its render and its source render [H,W,3]."""
+    def picture(
+        self, render: Float[Tensor, "H W 3"], source: Float[Tensor, "H W 3"], index: int, step: int
+    ) -> Float[Tensor, "H W 3"]:
+        """A finished picture of one view, in [0,1], of its render and its source render."""
 
     @abstractmethod
     def balanced(self) -> Prior:
         """An exact prior with those spreads that were left open."""
 
-    def in_balance(self, mean: Tensor, given: Step) -> Tensor:
+    def in_balance(self, mean: Float[Tensor, ""], given: Step) -> Float[Tensor, ""]:
         """A loss that is a mean over its own elements, at the strength at which it keeps its balance with `given`."""
         return mean
 
-    def expected(self, source: Tensor, index: int, timestep: int | None = None) -> Tensor | None:
-        """Where the rule comes to rest, [H,W,3]; None where that is not known or not stable."""
+    def expected(
+        self, source: Float[Tensor, "H W 3"], index: int, timestep: int | None = None
+    ) -> Float[Tensor, "H W 3"] | None:
+        """Where the rule comes to rest; None where that is not known or not stable."""
         return None
 
     def check_sampler(self) -> None:  # noqa: B027  (most have nothing that could diverge)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from jaxtyping import Float
 from torch import Tensor
 
 from .fixed_point import fixed_point
@@ -12,15 +13,15 @@ from .prompted import PromptedPrior
 from .rules import Rule
 
 
-def known_edit(prompted: PromptedPrior, source: Tensor, index: int) -> Tensor | None:
-    """The edit that the prior knows of a view's source render, [H,W,3] in [0,1]; None for a prior that learned."""
+def known_edit(prompted: PromptedPrior, source: Float[Tensor, "H W 3"], index: int) -> Float[Tensor, "H W 3"] | None:
+    """The edit that the prior knows of a view's source render, in [0,1]; None for a prior that learned."""
     return exact_edit(prompted, source, index, prompted.text) if prompted.prior.exact else None
 
 
 def resting_picture(
-    prompted: PromptedPrior, rule: Rule, source: Tensor, index: int, timesteps: Sequence[int]
-) -> Tensor | None:
-    """Where the rule's mean gradient over `timesteps` vanishes, [H,W,3], clamped to [0,1]; None where it is not known
+    prompted: PromptedPrior, rule: Rule, source: Float[Tensor, "H W 3"], index: int, timesteps: Sequence[int]
+) -> Float[Tensor, "H W 3"] | None:
+    """Where the rule's mean gradient over `timesteps` vanishes, clamped to [0,1]; None where it is not known
     or not stable."""
     if not prompted.prior.exact:
         return None
@@ -32,7 +33,9 @@ def resting_picture(
     return (source + rest.rho * (edit - reference) + rest.drift * from_mean).clamp(0, 1)
 
 
-def exact_edit(prompted: PromptedPrior, source: Tensor, index: int, text: Any) -> Tensor:
-    """What `text` (of `Prior.embed`) makes of a view's source render, [H,W,3] in [0,1]. Raises PriorError for a prior
+def exact_edit(
+    prompted: PromptedPrior, source: Float[Tensor, "H W 3"], index: int, text: Any
+) -> Float[Tensor, "H W 3"]:
+    """What `text` (of `Prior.embed`) makes of a view's source render, in [0,1]. Raises PriorError for a prior
     that is not exact."""
     return prompted.prior.known_edit(prompted.encode_source(source, index)[1], text)[0].permute(1, 2, 0)

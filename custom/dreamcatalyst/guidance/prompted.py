@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..cache import ByteCache
@@ -43,9 +44,9 @@ class PromptedPrior:
     # --- source views
 
     @torch.no_grad()
-    def encode_source(self, source: Tensor, index: int) -> tuple[Tensor, Any]:
-        """Latents [1,C,h,w] (the posterior's mode, where the prior draws them at every use) and condition of the source
-        render [H,W,3] of view `index`; computed once for each, as long as there is room (1 GiB)."""
+    def encode_source(self, source: Float[Tensor, "H W 3"], index: int) -> tuple[Float[Tensor, "1 C h w"], Any]:
+        """Latents (the posterior's mode, where the prior draws them at every use) and condition of the source
+        render of view `index`; computed once for each, as long as there is room (1 GiB)."""
         image = source.permute(2, 0, 1)[None]
         return self._views.get(index, lambda: (self.prior.encode(image), self.prior.condition_of(image, index)))
 
@@ -55,16 +56,18 @@ class PromptedPrior:
         self._deviations.clear()
 
     @torch.no_grad()
-    def source_latents(self, source: Tensor, index: int, step: int) -> Tensor:
-        """Latents [1,C,h,w] of a view's source render [H,W,3], of its posterior where the prior draws them."""
+    def source_latents(self, source: Float[Tensor, "H W 3"], index: int, step: int) -> Float[Tensor, "1 C h w"]:
+        """Latents of a view's source render, of its posterior where the prior draws them."""
         mode = self.encode_source(source, index)[0]
         if not self.prior.draws_latents:
             return mode
         deviation = self._deviations.get(index, lambda: self.prior.deviation(source.permute(2, 0, 1)[None]))
         return mode + deviation * self._posterior_noise("source", index, step, mode.shape[1:]).to(mode)
 
-    def encode_sources(self, sources: Tensor | None, index: Sequence[int], step: int) -> tuple[Tensor | None, Any]:
-        """Latents [B,C,h,w] and condition of source renders [B,H,W,3]; (None, None) where there are none."""
+    def encode_sources(
+        self, sources: Float[Tensor, "B H W 3"] | None, index: Sequence[int], step: int
+    ) -> tuple[Float[Tensor, "B C h w"] | None, Any]:
+        """Latents and condition of source renders; (None, None) where there are none."""
         if sources is None:
             return None, None
         views = list(zip(sources, index, strict=True))
@@ -74,20 +77,27 @@ class PromptedPrior:
 
     # --- renders
 
-    def encode(self, images: Tensor, index: Sequence[int], step: int) -> Tensor:
-        """Latents [B,C,h,w] of renders [B,H,W,3], with a graph."""
+    def encode(self, images: Float[Tensor, "B H W 3"], index: Sequence[int], step: int) -> Float[Tensor, "B C h w"]:
+        """Latents of renders, with a graph."""
         images = images.permute(0, 3, 1, 2)
         if not self.prior.draws_latents:
             return self.prior.encode(images)
         noise = [self._posterior_noise("edited", i, step, self.prior.latent_shape(images)) for i in index]
         return self.prior.encode(images, torch.stack(noise).to(images.device))
 
-    def decode(self, latents: Tensor, source: Tensor) -> Tensor:
-        """Latents [1,C,h,w] as an image [H,W,3] of the size of `source`."""
+    def decode(self, latents: Float[Tensor, "1 C h w"], source: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        """Latents as an image of the size of `source`."""
         return self.prior.decode(latents)[0].permute(1, 2, 0)[: source.shape[0], : source.shape[1]]
 
-    def edit_image(self, source: Tensor, index: int, latents: Tensor | None, noise: Tensor, **options: Any) -> Tensor:
-        """The prior's edit, [H,W,3] in [0,1], of latents [1,C,h,w] (None: of noise alone), conditioned on the source
+    def edit_image(
+        self,
+        source: Float[Tensor, "H W 3"],
+        index: int,
+        latents: Float[Tensor, "1 C h w"] | None,
+        noise: Float[Tensor, "1 C h w"],
+        **options: Any,
+    ) -> Float[Tensor, "H W 3"]:
+        """The prior's edit in [0,1] of latents (None: of noise alone), conditioned on the source
         render of a view. options: of ddim.edit_image; text and guidance_scale are the run's where not given."""
         edited = edit_image(
             self.prior,
@@ -100,19 +110,21 @@ class PromptedPrior:
         )
         return self.decode(edited, source)
 
-    def sample(self, source: Tensor, index: int, prompt: str, guidance_scale: float, steps: int) -> Tensor:
-        """The prior's own edit of a source render, without any rule: [H,W,3] in [0,1]."""
+    def sample(
+        self, source: Float[Tensor, "H W 3"], index: int, prompt: str, guidance_scale: float, steps: int
+    ) -> Float[Tensor, "H W 3"]:
+        """The prior's own edit of a source render, without any rule, in [0,1]."""
         text = self.text if prompt == self.prompt else self.prior.embed([prompt])[0]
         noise = self.noise(self.encode_source(source, index)[0], [index], 0)
         return self.edit_image(source, index, None, noise, text=text, guidance_scale=guidance_scale, steps=steps)
 
     # --- noise
 
-    def noise(self, latents: Tensor, index: Sequence[int], step: int) -> Tensor:
-        """Standard normal noise [B,C,h,w], a function of seed, step and view."""
+    def noise(self, latents: Float[Tensor, "_ C h w"], index: Sequence[int], step: int) -> Float[Tensor, "B C h w"]:
+        """Standard normal noise for latents of the views `index`, a function of seed, step and view."""
         shape, dtype, device = latents.shape[1:], latents.dtype, latents.device
         return torch.stack([keyed_noise(self.config.seed, step, i, shape, dtype, device) for i in index])
 
-    def _posterior_noise(self, branch: str, index: int, step: int, shape: Sequence[int]) -> Tensor:
+    def _posterior_noise(self, branch: str, index: int, step: int, shape: Sequence[int]) -> Float[Tensor, "C h w"]:
         generator = keyed_generator(self.config.seed, "posterior", branch, step, index)
         return torch.randn(tuple(shape), generator=generator)

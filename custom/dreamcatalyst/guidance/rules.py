@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..diffusion.noise import abar_at
@@ -40,7 +41,7 @@ PRESETS: dict[str, Parameters] = {
     "published-3dgs": Parameters(delta=0.05, gamma=0.2),  # what the published 3DGS code is run with: a quarter of a(t)
 }
 
-Weight = Callable[[Parameters, int, Tensor], float]
+Weight = Callable[[Parameters, int, Float[Tensor, " T"]], float]
 
 
 def noise_level(timestep: int, train_steps: int) -> float:
@@ -52,7 +53,7 @@ def noise_level(timestep: int, train_steps: int) -> float:
     return max(timestep - 1, 0) / train_steps
 
 
-def pds_coefficients(alphas_cumprod: Tensor, timestep: int, gap: int = 2) -> tuple[float, float]:
+def pds_coefficients(alphas_cumprod: Float[Tensor, " T"], timestep: int, gap: int = 2) -> tuple[float, float]:
     """(Phi, Psi) of Posterior Distillation Sampling (Koo et al. 2024) at index `timestep`.
 
     z_t(x_tgt) - z_t(x_src) = Phi (x - x_src) + Psi (eps_edit - eps_ref), where alpha_t and beta_t are those of the
@@ -65,8 +66,10 @@ def pds_coefficients(alphas_cumprod: Tensor, timestep: int, gap: int = 2) -> tup
     return float(phi), float(psi)
 
 
-def pds_coefficients_from_betas(betas: Tensor, timestep: int, gap: int = 2) -> tuple[Tensor, Tensor]:
-    """The same from beta_t [T], in the precision of `betas`: written without cancellation, so that float32 will do.
+def pds_coefficients_from_betas(
+    betas: Float[Tensor, " T"], timestep: int, gap: int = 2
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """The same from beta_t, in the precision of `betas`: written without cancellation, so that float32 will do.
 
     With q = abar_{t-1} / abar_p:  Phi = alpha_t sqrt(abar_p) (1 - sqrt q) (1 + abar_p sqrt q) / ((1 - abar_t) sigma_t),
     sigma_t^2 = beta_t (1 - abar_p) / (1 - abar_t);  Psi = sqrt(abar_p) beta_t / sqrt(abar_t (1 - abar_t)) / sigma_t.
@@ -99,35 +102,35 @@ def pds_coefficients_from_betas(betas: Tensor, timestep: int, gap: int = 2) -> t
     return phi / (one_minus_t * sigma), psi / sigma
 
 
-def _zero(p: Parameters, t: int, abar: Tensor) -> float:
+def _zero(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return 0.0
 
 
-def _one(p: Parameters, t: int, abar: Tensor) -> float:
+def _one(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return 1.0
 
 
-def _noise_variance(p: Parameters, t: int, abar: Tensor) -> float:
+def _noise_variance(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return 1.0 - abar_at(abar, t)
 
 
-def _psi1(p: Parameters, t: int, abar: Tensor) -> float:
+def _psi1(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return p.delta + p.gamma * noise_level(t, len(abar)) ** (1.0 / math.e)
 
 
-def _psi3(p: Parameters, t: int, abar: Tensor) -> float:
+def _psi3(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return 1.0 - 0.2 * noise_level(t, len(abar))
 
 
-def _phi(p: Parameters, t: int, abar: Tensor) -> float:
+def _phi(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return p.chi * math.exp(noise_level(t, len(abar)))
 
 
-def _pds_phi(p: Parameters, t: int, abar: Tensor) -> float:
+def _pds_phi(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return pds_coefficients(abar, t, p.gap)[0]
 
 
-def _pds_psi(p: Parameters, t: int, abar: Tensor) -> float:
+def _pds_psi(p: Parameters, t: int, abar: Float[Tensor, " T"]) -> float:
     return pds_coefficients(abar, t, p.gap)[1]
 
 
@@ -158,7 +161,7 @@ class Rule:
         """Whether it compares with the source's latents, or with no noise that is known."""
         return self.reference != NOISE
 
-    def weights(self, timestep: int, alphas_cumprod: Tensor) -> tuple[float, float]:
+    def weights(self, timestep: int, alphas_cumprod: Float[Tensor, " T"]) -> tuple[float, float]:
         """(a, b) at index `timestep` of a prior with this schedule.
 
         With an implicit step h, both divided by 1 + h b: x - h g then is the backward Euler step of the identity term,

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..diffusion.noise import keyed_generator
@@ -20,11 +21,11 @@ POLICIES = Registry("timestep policy", __package__)
 
 @dataclass(frozen=True)
 class Policy:
-    """options(progress, alphas_cumprod [T], lowest, highest): the timesteps 0..T-1 that a step may take, all equally
+    """options(progress, alphas_cumprod, lowest, highest): the timesteps 0..T-1 that a step may take, all equally
     likely; one for a policy that draws nothing. progress is 0 at a run's first step and 1 at its last.
     lowest, highest: default limits, as fractions of the noise levels."""
 
-    options: Callable[[float, Tensor, float, float], Sequence[int]]
+    options: Callable[[float, Float[Tensor, " T"], float, float], Sequence[int]]
     lowest: float
     highest: float
 
@@ -38,7 +39,7 @@ def _ddim(index: int, train_steps: int) -> int:
     return min(index * train_steps // DDIM_STEPS + 1, train_steps - 1)
 
 
-def decreasing(progress: float, alphas_cumprod: Tensor, lowest: float, highest: float) -> list[int]:
+def decreasing(progress: float, alphas_cumprod: Float[Tensor, " T"], lowest: float, highest: float) -> list[int]:
     """From `highest` to `lowest` of 500 DDIM steps, rounded down, hence with repeats: 901 to 201 at 0.9 and 0.2.
 
     Source: the code published with DreamCatalyst, with progress in place of its count of calls.
@@ -47,12 +48,12 @@ def decreasing(progress: float, alphas_cumprod: Tensor, lowest: float, highest: 
     return [_ddim(math.floor(index + 1e-9), len(alphas_cumprod))]
 
 
-def decreasing_full(progress: float, alphas_cumprod: Tensor, lowest: float, highest: float) -> list[int]:
+def decreasing_full(progress: float, alphas_cumprod: Float[Tensor, " T"], lowest: float, highest: float) -> list[int]:
     """From T - 1 to 0 evenly, as DreamCatalyst's text has it."""
     return [round((len(alphas_cumprod) - 1) * (highest + (lowest - highest) * progress))]
 
 
-def uniform(progress: float, alphas_cumprod: Tensor, lowest: float, highest: float) -> list[int]:
+def uniform(progress: float, alphas_cumprod: Float[Tensor, " T"], lowest: float, highest: float) -> list[int]:
     """Any of the DDIM steps between the limits, the upper one left out: i = 10..489 of 500 at 0.02 and 0.98.
 
     Source: Poole et al. 2023 (limits); the code published with PDS (indices).
@@ -61,7 +62,7 @@ def uniform(progress: float, alphas_cumprod: Tensor, lowest: float, highest: flo
     return [_ddim(index, len(alphas_cumprod)) for index in range(low, max(_index(highest), low + 1))]
 
 
-def non_increasing(progress: float, alphas_cumprod: Tensor, lowest: float, highest: float) -> list[int]:
+def non_increasing(progress: float, alphas_cumprod: Float[Tensor, " T"], lowest: float, highest: float) -> list[int]:
     """From high t to low, the time spent at t proportional to W(t) = W_d W_p, where W_d = sqrt((1 - abar_t) / abar_t)
     is the noise-to-signal ratio and W_p = exp(-(t - m)^2 / (2 s^2)) prefers the timesteps that make content.
 
@@ -120,19 +121,19 @@ class Schedule:
             policy.highest if self.highest is None else self.highest,
         )
 
-    def options(self, progress: float, alphas_cumprod: Tensor) -> Sequence[int]:
+    def options(self, progress: float, alphas_cumprod: Float[Tensor, " T"]) -> Sequence[int]:
         """The timesteps that a step at `progress` may take, all equally likely."""
         return POLICIES.get(self.policy).options(progress, alphas_cumprod, *self.limits)
 
-    def timestep(self, step: int, max_steps: int, alphas_cumprod: Tensor) -> int:
-        """The index 0..T-1 into alphas_cumprod [T] that `step` (from 0) of `max_steps` takes: a pure function of these,
+    def timestep(self, step: int, max_steps: int, alphas_cumprod: Float[Tensor, " T"]) -> int:
+        """The index 0..T-1 into alphas_cumprod that `step` (from 0) of `max_steps` takes: a pure function of these,
         and of the seed where the policy draws."""
         options = self.options(progress_of(step, self.steps or max_steps), alphas_cumprod)
         if len(options) == 1:
             return options[0]
         return options[int(torch.randint(len(options), (), generator=keyed_generator(self.seed, "timestep", step)))]
 
-    def rest(self, alphas_cumprod: Tensor) -> Sequence[int]:
+    def rest(self, alphas_cumprod: Float[Tensor, " T"]) -> Sequence[int]:
         """The timesteps that a run over the whole schedule comes to rest under: its last one, or all that a random
         policy draws."""
         return self.options(1.0, alphas_cumprod)
