@@ -6,18 +6,17 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from beartype import BeartypeConf, BeartypeHintOverrides, beartype
+from beartype import BeartypeConf, FrozenDict, beartype
 from jaxtyping import install_import_hook
 from omegaconf import DictConfig
 
 ROOT = Path(__file__).resolve().parent.parent / "custom"
 COMPILED = re.compile(r"^from numba import|^@njit|^@kernel", re.MULTILINE)  # numba cannot compile a checked function
 
-FOLDERS = ("data", "scene", "render", "diffusion", "guidance", "loss")  # those whose annotations hold
+# Those whose annotations hold.
+FOLDERS = ("data", "scene", "render", "demo", "diffusion", "guidance", "segment", "loss", "report")
 # An int may stand for a float, and a section of OmegaConf for a dict, as in its own structured configs.
-_beartype = beartype(
-    conf=BeartypeConf(is_pep484_tower=True, hint_overrides=BeartypeHintOverrides({dict: dict | DictConfig}))
-)
+_beartype = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=FrozenDict({dict: dict | DictConfig})))
 
 
 def checked(function: Callable) -> Callable:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..scene.gaussians import Gaussians
@@ -24,13 +25,21 @@ def with_addition(world: World, make: Maker, part: str) -> Gaussians:
     return Gaussians.cat([world.scene, label(part, make(solids["head"], solids["body"], world.light))])
 
 
-def painted(points: Tensor, normals: Tensor, widths: Tensor, albedo: Tensor, light: Light) -> Gaussians:
-    """A lit surface of colours albedo [N,3]."""
+def painted(
+    points: Float[Tensor, "N 3"],
+    normals: Float[Tensor, "N 3"],
+    widths: Float[Tensor, " N"],
+    albedo: Float[Tensor, "N 3"],
+    light: Light,
+) -> Gaussians:
+    """A lit surface of colours albedo."""
     return surface(points, normals, widths, albedo * light.lit(normals))
 
 
-def striped(share: Tensor, first: tuple[float, ...], second: tuple[float, ...], count: float) -> Tensor:
-    """Colours [N,3] in `count` pairs of stripes along share [N] in [0,1]."""
+def striped(
+    share: Float[Tensor, " N"], first: tuple[float, ...], second: tuple[float, ...], count: float
+) -> Float[Tensor, "N 3"]:
+    """Colours in `count` pairs of stripes along share in [0,1]."""
     where = torch.sigmoid(torch.sin(2 * math.pi * count * share) / 0.15)[:, None]
     return where * share.new_tensor(first) + (1 - where) * share.new_tensor(second)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from numpy.random import Generator
 from torch import Tensor
 
@@ -47,8 +48,8 @@ def posed(pose: str) -> list[Solid]:
     return body[:2] + head + body[2:]
 
 
-def turned(part: Solid, about: Tensor, rotation: Tensor, scale: float = 1.0) -> Solid:
-    """`part` turned and scaled about the point `about` [3]."""
+def turned(part: Solid, about: Float[Tensor, " 3"], rotation: Float[Tensor, "3 3"], scale: float = 1.0) -> Solid:
+    """`part` turned and scaled about the point `about`."""
     center = about + scale * rotation @ (part.center - about)
     return replace(part, center=center, radii=part.radii * scale, rotation=rotation @ part.rotation)
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..scene.gaussians import SH_C0, Gaussians
@@ -13,15 +14,17 @@ from .shapes import facing, frames, speckle
 from .worlds import Solid, Thing, World
 
 FUR_SHADE = 0.8  # fur scatters light: softer shade than a stone's
-Coat = Callable[[Thing, Solid, Tensor], Tensor]  # thing, its solid, points [n,3] in the world -> albedo [n,3]
+Coat = Callable[
+    [Thing, Solid, Float[Tensor, "N 3"]], Float[Tensor, "N 3"]
+]  # thing, its solid, points in the world -> albedo
 
 
-def colors_of(scene: Gaussians) -> Tensor:
-    """Plain colours [N,3] of splats without view dependence."""
+def colors_of(scene: Gaussians) -> Float[Tensor, "N 3"]:
+    """Plain colours of splats without view dependence."""
     return 0.5 + SH_C0 * scene.sh0[:, 0]
 
 
-def with_rows(scene: Gaussians, first: int, **fields: Tensor) -> Gaussians:
+def with_rows(scene: Gaussians, first: int, **fields: Float[Tensor, "n ..."]) -> Gaussians:
     """`scene` with the rows from `first` on replaced in the named parameters; `colors` [n,3] stands for sh0."""
     if "colors" in fields:
         fields["sh0"] = ((fields.pop("colors").clamp(0, 1) - 0.5) / SH_C0)[:, None]
@@ -32,8 +35,8 @@ def with_rows(scene: Gaussians, first: int, **fields: Tensor) -> Gaussians:
     return replace(scene, **out)
 
 
-def soft(x: Tensor, edge: float, width: float) -> Tensor:
-    """1 where x is well below `edge`, 0 well above, over about `width`; [n] -> [n,1]."""
+def soft(x: Float[Tensor, " N"], edge: float, width: float) -> Float[Tensor, "N 1"]:
+    """1 where x is well below `edge`, 0 well above, over about `width`."""
     return torch.sigmoid((edge - x) / width)[:, None]
 
 
@@ -41,8 +44,8 @@ def _part(thing: Thing, name: str) -> Solid:
     return next(solid for solid in thing.solids if solid.name == name)
 
 
-def _patch(points: Tensor, eye: Solid, head: Solid) -> Tensor:
-    """How dark [n,1] the panda's patch around `eye` is at `points` of the head: an oval that hangs outwards."""
+def _patch(points: Float[Tensor, "N 3"], eye: Solid, head: Solid) -> Float[Tensor, "N 1"]:
+    """How dark the panda's patch around `eye` is at `points` of the head: an oval that hangs outwards."""
     middle, away = (eye.center - head.center) @ head.rotation, (points - eye.center) @ head.rotation
     size = eye.radii[2] / 0.028  # the statue's eye
     out, up = torch.sign(middle[1]) * away[:, 1] / size - 0.008, away[:, 2] / size + 0.010
@@ -50,7 +53,7 @@ def _patch(points: Tensor, eye: Solid, head: Solid) -> Tensor:
     return soft((long / 0.076).square() + (short / 0.054).square() + (away[:, 0] / size / 0.12).square(), 1.0, 0.12)
 
 
-def panda(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
+def panda(thing: Thing, solid: Solid, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """White; black are ears, the patches around the eyes, nose, limbs and the band over the shoulders."""
     white, black = points.new_tensor([0.93, 0.92, 0.88]), points.new_tensor([0.07, 0.07, 0.08])
     dark = points.new_zeros(len(points), 1)
@@ -67,7 +70,7 @@ def panda(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
     return white * (1 - dark) + black * dark
 
 
-def polar_bear(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
+def polar_bear(thing: Thing, solid: Solid, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """Creamy white; nose and eyes black, the muzzle and inside of the ears a little greyer."""
     color = {
         "nose": (0.06, 0.06, 0.07),
@@ -78,7 +81,7 @@ def polar_bear(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
     return points.new_tensor(color.get(solid.name, (0.96, 0.94, 0.87))).expand(len(points), 3)
 
 
-def grizzly(thing: Thing, solid: Solid, points: Tensor) -> Tensor:
+def grizzly(thing: Thing, solid: Solid, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """Brown, darker towards the paws, with a tan muzzle and lighter, grizzled shoulders."""
     color = {
         "nose": (0.06, 0.05, 0.05),
@@ -141,8 +144,8 @@ def dress(world: World, coat: Coat, shape: dict[str, tuple[float, ...]], thing: 
     return scene
 
 
-def ramp(x: Tensor, stops: tuple[tuple[float, float, float], ...]) -> Tensor:
-    """Colours [n,3] along `stops`, evenly spaced over x [n] in 0..1."""
+def ramp(x: Float[Tensor, " N"], stops: tuple[tuple[float, float, float], ...]) -> Float[Tensor, "N 3"]:
+    """Colours along `stops`, evenly spaced over x in 0..1."""
     table = x.new_tensor(stops)
     at = x.clamp(0, 1) * (len(stops) - 1)
     i = at.floor().long().clamp(max=len(stops) - 2)
@@ -154,8 +157,8 @@ BRONZE = ((0.05, 0.05, 0.04), (0.20, 0.15, 0.09), (0.42, 0.29, 0.15), (0.66, 0.4
 GOLD = ((0.16, 0.08, 0.01), (0.50, 0.29, 0.02), (0.86, 0.60, 0.08), (1.0, 0.85, 0.32), (1.0, 0.98, 0.82))
 
 
-def _grain(rows: Gaussians, lit: Tensor) -> Tensor:
-    """Brightness [n] of splats without their light `lit` [n]: about 1 on the plain surface, less on eyes and joints."""
+def _grain(rows: Gaussians, lit: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Brightness of splats without their light `lit`: about 1 on the plain surface, less on eyes and joints."""
     bare = colors_of(rows).mean(-1) / lit
     return (bare / bare.median()).clamp(0.2, 1.3)
 

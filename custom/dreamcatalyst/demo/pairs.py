@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped, UInt8
 from numpy import ndarray
 from numpy.random import Generator
 from torch import Tensor
@@ -20,7 +21,7 @@ from ..files import replacing, write_text
 from ..render.api import rasterize
 from ..scene.gaussians import Gaussians
 from .edits import EDITS, NOTHING, WorldEdit, apply_edit, possible
-from .photographs import crop, load_photographs
+from .photographs import Picture, crop, load_photographs
 from .random_world import HELD_OUT, random_world
 from .worlds import World
 
@@ -40,7 +41,8 @@ ARRAYS = {  # of a shard: number type and shape
     "edit": (np.str_, PAIRS[:1]),
 }
 
-Operators = Callable[[str], Callable[[Tensor], Tensor]]  # an edit's name -> RGB [B,3,H,W] in [0,1] to the same
+Images = Float[Tensor, "B 3 H W"]
+Operators = Callable[[str], Callable[[Images], Images]]  # an edit's name -> RGB in [0,1] to the same
 
 
 def worded(edit: WorldEdit, rng: Generator) -> str:
@@ -61,16 +63,20 @@ def drawn(known: list[WorldEdit], rng: Generator) -> list[WorldEdit]:
     return [known[i] for i in chosen]
 
 
-def _pair(source: ndarray, edited: ndarray, mask: ndarray, edit: WorldEdit, world: int, rng: Generator) -> dict:
+def _pair(
+    source: Picture, edited: Picture, mask: UInt8[ndarray, "H W"], edit: WorldEdit, world: int, rng: Generator
+) -> dict:
     return dict(source=source, edited=edited, mask=mask, instruction=worded(edit, rng), edit=edit.name, world=world)
 
 
-def _bytes(images: Tensor) -> ndarray:
+def _bytes(images: Float[Tensor, "*shape"]) -> UInt8[ndarray, "*shape"]:
     return (images.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
-def _render(scene: Gaussians, cameras: Cameras, rows: tuple[int, int]) -> tuple[ndarray, Tensor]:
-    """Images uint8 [V,H,W,3], and how much of each pixel [V,H,W] is made up of the splats in `rows`."""
+def _render(
+    scene: Gaussians, cameras: Cameras, rows: tuple[int, int]
+) -> tuple[UInt8[ndarray, "V H W 3"], Float[Tensor, "V H W"]]:
+    """Images, and how much of each pixel is made up of the splats in `rows`."""
     share = scene.means.new_zeros(len(scene), 1)
     share[rows[0] : rows[1]] = 1
     with torch.no_grad():
@@ -92,7 +98,7 @@ def world_pairs(world: World, rng: Generator) -> Iterator[dict]:
             yield _pair(source[i], edited[i], mask[i], edit, world.seed, rng)
 
 
-def photograph_pairs(images: list[ndarray], operators: Operators, size: int, rng: Generator) -> Iterator[dict]:
+def photograph_pairs(images: list[Picture], operators: Operators, size: int, rng: Generator) -> Iterator[dict]:
     """Some global edits of a crop of one of `images`, as pairs; their world is -1."""
     source = crop(images, size, rng)
     tensor = torch.from_numpy(source).permute(2, 0, 1)[None].float() / 255
@@ -103,7 +109,7 @@ def photograph_pairs(images: list[ndarray], operators: Operators, size: int, rng
         yield _pair(source, edited, np.full((size, size), 255, np.uint8), edit, -1, rng)
 
 
-def shard_pairs(seed: int, index: int, size: int, images: list[ndarray], operators: Operators | None) -> Iterator[dict]:
+def shard_pairs(seed: int, index: int, size: int, images: list[Picture], operators: Operators | None) -> Iterator[dict]:
     """The pairs of one shard, without end: the first n are the same whatever is taken."""
     rng = np.random.default_rng([seed, index])
     while True:
@@ -127,7 +133,7 @@ def _count(file: Path) -> int:
     return len(_arrays(file, ["world"])["world"]) if file.exists() else 0
 
 
-def _arrays(file: Path, names: Iterable[str]) -> dict[str, ndarray]:
+def _arrays(file: Path, names: Iterable[str]) -> dict[str, Shaped[ndarray, "pairs ..."]]:
     """These arrays of a shard. Raises DataError where the file is no archive of arrays, or lacks one."""
     try:
         with np.load(file) as shard:
@@ -140,7 +146,7 @@ def _arrays(file: Path, names: Iterable[str]) -> dict[str, ndarray]:
     raise DataError(f"{file}: has no '{lacking[0]}', which a shard of pairs needs (found {found or 'nothing'})")
 
 
-def _shard(file: Path, size: tuple[int, ...] | None) -> dict[str, ndarray]:
+def _shard(file: Path, size: tuple[int, ...] | None) -> dict[str, Shaped[ndarray, "pairs ..."]]:
     """The arrays of a shard, each with the number type and the shape that `make_pairs` describes. size: height and
     width of the pairs before it. Raises DataError."""
     arrays = _arrays(file, ARRAYS)
@@ -178,7 +184,7 @@ def make_pairs(folder: Path, count: int, seed: int, size: int = 128, photographs
             np.savez(out, **arrays)
 
 
-def read_pairs(folder: Path) -> dict[str, ndarray]:
+def read_pairs(folder: Path) -> dict[str, Shaped[ndarray, "pairs ..."]]:
     """All pairs of `folder` in the order of their shards, as the arrays that make_pairs describes, in memory
     (about 115 kB a pair at 128 x 128). Raises DataError where there is none, or a shard is damaged or holds anything
     else."""

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 from numpy import ndarray
 from numpy.random import Generator
 
 from ..errors import ConfigError, DataError
+
+Picture = UInt8[ndarray, "H W 3"]
 
 # Package as it is imported, as it is installed, and its files, each with author and licence.
 PHOTOGRAPHS: tuple[tuple[str, str, dict[str, str]], ...] = (
@@ -35,8 +38,8 @@ PHOTOGRAPHS: tuple[tuple[str, str, dict[str, str]], ...] = (
 )
 
 
-def load_photographs() -> list[ndarray]:
-    """All of PHOTOGRAPHS, RGB uint8 [H,W,3]. Raises ConfigError where a package is not installed, DataError where it
+def load_photographs() -> list[Picture]:
+    """All of PHOTOGRAPHS, RGB. Raises ConfigError where a package is not installed, DataError where it
     lacks the file."""
     found = []
     for package, distribution, files in PHOTOGRAPHS:
@@ -55,8 +58,8 @@ def load_photographs() -> list[ndarray]:
     return found
 
 
-def crop(images: list[ndarray], size: int, rng: Generator) -> ndarray:
-    """A random square of a random one of `images`, mirrored at times, uint8 [size,size,3]."""
+def crop(images: list[Picture], size: int, rng: Generator) -> UInt8[ndarray, "{size} {size} 3"]:
+    """A random square of a random one of `images`, mirrored at times."""
     image = images[rng.integers(len(images))]
     height, width = image.shape[:2]
     side = int(rng.uniform(0.45, 1.0) * min(height, width))

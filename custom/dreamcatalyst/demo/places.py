@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.random import Generator
 from torch import Tensor
 
@@ -21,30 +22,30 @@ FLOOR_SPLATS, SKY_SPLATS = 4200, 1700
 Palette = tuple[tuple[float, float, float], ...]
 
 
-def near(color: Sequence[float], rng: Generator, tint: float = 0.03, value: float = 0.15) -> Tensor:
-    """A colour [3] near `color`: brighter or darker by up to `value` of itself, each channel moved by about `tint`."""
+def near(color: Sequence[float], rng: Generator, tint: float = 0.03, value: float = 0.15) -> Float[Tensor, " 3"]:
+    """A colour near `color`: brighter or darker by up to `value` of itself, each channel moved by about `tint`."""
     jitter = rng.uniform(1 - value, 1 + value) * (1 + tint * rng.normal(size=3))
     return torch.tensor(np.clip(np.array(color) * jitter, 0.02, 0.98), dtype=torch.float32)
 
 
-def one_of(palette: Palette, rng: Generator) -> Tensor:
-    """A colour [3] near one of `palette`."""
+def one_of(palette: Palette, rng: Generator) -> Float[Tensor, " 3"]:
+    """A colour near one of `palette`."""
     return near(palette[rng.integers(len(palette))], rng)
 
 
-def cells(ij: Tensor, seed: int) -> Tensor:
-    """A repeatable number in [0,1) for every integer cell ij [N,2]."""
+def cells(ij: Float[Tensor, "N 2"], seed: int) -> Float[Tensor, " N"]:
+    """A repeatable number in [0,1) for every integer cell ij."""
     wave = torch.sin(ij.double() @ torch.tensor([12.9898, 78.233], dtype=torch.float64) + seed % 1000) * 43758.5453
     return (wave - wave.floor()).float()
 
 
-def mottled(points: Tensor, rng: Generator, coarse: float, fine: float) -> Tensor:
-    """Brightness [N,1] around 1 with spots of about 0.9 and 0.17 units and the given strengths."""
+def mottled(points: Float[Tensor, "N 3"], rng: Generator, coarse: float, fine: float) -> Float[Tensor, "N 1"]:
+    """Brightness around 1 with spots of about 0.9 and 0.17 units and the given strengths."""
     seed = int(rng.integers(2**31))
     return (1 + speckle(points, seed, coarse, 0.9) + speckle(points, seed + 1, fine, 0.17))[:, None]
 
 
-def lawn(points: Tensor, rng: Generator) -> Tensor:
+def lawn(points: Float[Tensor, "N 3"], rng: Generator) -> Float[Tensor, "N 3"]:
     """Grass, half the time with a round path around the middle, as the statue's own."""
     color = one_of(((0.30, 0.44, 0.20), (0.36, 0.48, 0.18), (0.24, 0.38, 0.20)), rng).expand(len(points), 3)
     if rng.random() < 0.5:
@@ -56,7 +57,7 @@ def lawn(points: Tensor, rng: Generator) -> Tensor:
     return color * mottled(points, rng, 0.25, 0.22)
 
 
-def paving(points: Tensor, rng: Generator) -> Tensor:
+def paving(points: Float[Tensor, "N 3"], rng: Generator) -> Float[Tensor, "N 3"]:
     """Slabs with darker joints."""
     angle, size = rng.uniform(0, math.pi / 2), rng.uniform(0.35, 0.7)
     c, s = math.cos(angle), math.sin(angle)
@@ -69,7 +70,7 @@ def paving(points: Tensor, rng: Generator) -> Tensor:
     return stone * tone[:, None] * mottled(points, rng, 0.08, 0.06)
 
 
-def sand(points: Tensor, rng: Generator) -> Tensor:
+def sand(points: Float[Tensor, "N 3"], rng: Generator) -> Float[Tensor, "N 3"]:
     """Sand with ripples."""
     angle = rng.uniform(0, math.pi)
     along = points[:, :2] @ torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float32)
@@ -79,7 +80,7 @@ def sand(points: Tensor, rng: Generator) -> Tensor:
     return color * ripple[:, None] * mottled(points, rng, 0.06, 0.06)
 
 
-def wood(points: Tensor, rng: Generator) -> Tensor:
+def wood(points: Float[Tensor, "N 3"], rng: Generator) -> Float[Tensor, "N 3"]:
     """Boards with grain along them."""
     angle, size = rng.uniform(0, math.pi), rng.uniform(0.22, 0.4)
     c, s = math.cos(angle), math.sin(angle)
@@ -93,13 +94,13 @@ def wood(points: Tensor, rng: Generator) -> Tensor:
     return color * (tone * (1 + grain) - 0.3 * gap)[:, None]
 
 
-def earth(points: Tensor, rng: Generator) -> Tensor:
+def earth(points: Float[Tensor, "N 3"], rng: Generator) -> Float[Tensor, "N 3"]:
     """Bare earth or gravel."""
     color = one_of(((0.45, 0.36, 0.27), (0.55, 0.52, 0.48), (0.50, 0.42, 0.34), (0.38, 0.33, 0.28)), rng)
     return color * mottled(points, rng, 0.15, 0.25)
 
 
-def meadow(points: Tensor, rng: Generator) -> Tensor:
+def meadow(points: Float[Tensor, "N 3"], rng: Generator) -> Float[Tensor, "N 3"]:
     """Grass with patches of earth."""
     patch = torch.sigmoid(speckle(points, int(rng.integers(2**31)), 6.0, 1.8) - rng.uniform(0, 2))[:, None]
     return lawn(points, rng) * (1 - patch) + earth(points, rng) * patch
@@ -115,8 +116,10 @@ OUTDOORS: dict[str, tuple[Callable, float]] = {  # ground and how often it is dr
 INDOORS: dict[str, tuple[Callable, float]] = {"wood": (wood, 0.6), "paving": (paving, 0.4)}
 
 
-def floor(rng: Generator, light: Light, level: float, kinds: dict, square: bool, shadows: Tensor) -> Gaussians:
-    """A ground at height `level`. shadows [K,3]: x, y and radius of the soft dark spot below each thing."""
+def floor(
+    rng: Generator, light: Light, level: float, kinds: dict, square: bool, shadows: Float[Tensor, "K 3"]
+) -> Gaussians:
+    """A ground at height `level`. shadows: x, y and radius of the soft dark spot below each thing."""
     names, chances = list(kinds), np.array([chance for _, chance in kinds.values()])
     kind = kinds[names[rng.choice(len(names), p=chances / chances.sum())]][0]
     if square:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.random import Generator
 from torch import Tensor
 
@@ -70,7 +71,7 @@ def bear(rng: Generator, light: Light, first: int) -> tuple[Gaussians, Thing]:
     return scene, statue(placed, first)
 
 
-def ball(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussians]:
+def ball(rng: Generator, light: Light, at: Float[Tensor, " 2"], size: float) -> list[Gaussians]:
     """A ball, plain or with a band around it."""
     points, normals, widths = ellipsoid((*at.tolist(), LEVEL + size), (size,) * 3, max(0.03, 0.1 * size))
     color = one_of(PAINTS, rng).expand(len(points), 3)
@@ -81,7 +82,7 @@ def ball(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussian
     return [label("ball", surface(points, normals, widths, color))]
 
 
-def box(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussians]:
+def box(rng: Generator, light: Light, at: Float[Tensor, " 2"], size: float) -> list[Gaussians]:
     """A box of painted boards, five sides of it."""
     half = torch.tensor([size * rng.uniform(0.8, 1.2), size * rng.uniform(0.8, 1.2), size * rng.uniform(0.7, 1.3)])
     spin, (a, b, c) = turn("z", rng.uniform(0, 360)), half.float().tolist()
@@ -101,7 +102,7 @@ def box(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussians
     return [Gaussians.cat(made)]
 
 
-def plant(rng: Generator, light: Light, at: Tensor, size: float) -> list[Gaussians]:
+def plant(rng: Generator, light: Light, at: Float[Tensor, " 2"], size: float) -> list[Gaussians]:
     """A pot, and the leaves in it."""
     x, y = at.tolist()
     points, normals, widths = ellipsoid(
@@ -143,8 +144,8 @@ def cameras_around(rng: Generator, n: int, size: int) -> Cameras:
     return Cameras(look_at(eye.float(), target.float(), torch.tensor([0.0, 0.0, 1.0])), K, size, size)
 
 
-def arranged(rng: Generator, with_bear: bool) -> list[tuple[str, Tensor, float]]:
-    """What stands around the bear, or in its place and around that: kind, place [2] on the ground, size."""
+def arranged(rng: Generator, with_bear: bool) -> list[tuple[str, Float[Tensor, " 2"], float]]:
+    """What stands around the bear, or in its place and around that: kind, place on the ground, size."""
     kinds = [str(kind) for kind in rng.permutation(["ball", "box", "flower pot"])]
     kinds = kinds[: rng.choice(3, p=[0.5, 0.35, 0.15])] if with_bear else kinds[: rng.integers(1, 3)]
     start, out = rng.uniform(0, 2 * math.pi), []
@@ -158,8 +159,8 @@ def arranged(rng: Generator, with_bear: bool) -> list[tuple[str, Tensor, float]]
     return out
 
 
-def surroundings(rng: Generator, light: Light, shadows: Tensor) -> list[Gaussians]:
-    """Ground with sky, trees and walls as they come, or a room. shadows [K,3]: as `floor` takes them."""
+def surroundings(rng: Generator, light: Light, shadows: Float[Tensor, "K 3"]) -> list[Gaussians]:
+    """Ground with sky, trees and walls as they come, or a room. shadows: as `floor` takes them."""
     if rng.random() < 0.18:
         return [floor(rng, light, LEVEL, INDOORS, True, shadows), *room(rng, light, LEVEL)]
     made = [floor(rng, light, LEVEL, OUTDOORS, False, shadows), sky(rng)]

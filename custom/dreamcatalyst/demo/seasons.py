@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..scene.gaussians import Gaussians
@@ -13,23 +14,23 @@ from .shapes import facing, speckle
 from .worlds import World, part_mask
 
 
-def _recolored(world: World, colors: Tensor) -> Gaussians:
+def _recolored(world: World, colors: Float[Tensor, "N 3"]) -> Gaussians:
     return with_rows(world.scene, 0, colors=colors)
 
 
-def _saturated(colors: Tensor, amount: float) -> Tensor:
+def _saturated(colors: Float[Tensor, "N 3"], amount: float) -> Float[Tensor, "N 3"]:
     grey = (colors @ colors.new_tensor([0.299, 0.587, 0.114]))[:, None]
     return grey + amount * (colors - grey)
 
 
-def _ahead(world: World) -> Tensor:
-    """The horizontal direction of the lamp, [3] unit: where a low sun or moon stands."""
+def _ahead(world: World) -> Float[Tensor, " 3"]:
+    """The horizontal direction of the lamp, a unit vector: where a low sun or moon stands."""
     x, y, _ = world.light.direction
     return torch.nn.functional.normalize(torch.tensor([x, y, 0.0]) + 1e-6, dim=0)
 
 
-def _gradient(height: Tensor, *stops: tuple[float, tuple[float, float, float]]) -> Tensor:
-    """Colours [N,3] between `stops` of (height, colour), linear in height [N]."""
+def _gradient(height: Float[Tensor, " N"], *stops: tuple[float, tuple[float, float, float]]) -> Float[Tensor, "N 3"]:
+    """Colours between `stops` of (height, colour), linear in height."""
     out = height.new_tensor(stops[0][1]).expand(len(height), 3)
     for (low, _), (high, color) in zip(stops, stops[1:], strict=False):
         part = ((height - low) / (high - low)).clamp(0, 1)[:, None]
@@ -37,9 +38,9 @@ def _gradient(height: Tensor, *stops: tuple[float, tuple[float, float, float]]) 
     return out
 
 
-def _heavens(world: World) -> tuple[Tensor, Tensor, Tensor]:
-    """Of every splat: whether it is sky [N,1] (0 or 1), the sine of its height above the horizon [N], and how bright a
-    cloud it is [N,1] (0 for clear blue, 1 for white)."""
+def _heavens(world: World) -> tuple[Float[Tensor, "N 1"], Float[Tensor, " N"], Float[Tensor, "N 1"]]:
+    """Of every splat: whether it is sky (0 or 1), the sine of its height above the horizon, and how bright a
+    cloud it is (0 for clear blue, 1 for white)."""
     sky = part_mask(world.scene, "sky")[:, None].float()
     unit = torch.nn.functional.normalize(world.scene.means, dim=-1)
     colors = colors_of(world.scene)

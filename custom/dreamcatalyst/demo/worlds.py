@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..data.camera import Cameras, look_at
@@ -41,17 +42,17 @@ UPRIGHT = torch.eye(3)
 
 @dataclass(frozen=True)
 class Solid:
-    """An ellipsoid of the scene. center [3] world units; radii [3] along its own axes, world units;
-    rotation [3,3]: from its own axes to the world's; rows: first and one past the last of its splats."""
+    """An ellipsoid of the scene. center: world units; radii: along its own axes, world units;
+    rotation: from its own axes to the world's; rows: first and one past the last of its splats."""
 
     name: str
-    center: Tensor
-    radii: Tensor
-    rotation: Tensor = field(default_factory=lambda: UPRIGHT)
+    center: Float[Tensor, " 3"]
+    radii: Float[Tensor, " 3"]
+    rotation: Float[Tensor, "3 3"] = field(default_factory=lambda: UPRIGHT)
     rows: tuple[int, int] = (0, 0)
 
-    def local(self, points: Tensor) -> Tensor:
-        """Points [N,3] in the solid's own axes and radii: of length 1 on its surface."""
+    def local(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Points in the solid's own axes and radii: of length 1 on its surface."""
         return (points - self.center) @ self.rotation / self.radii
 
 
@@ -67,7 +68,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class World:
-    """A made scene. scene: splats with the extra "part" [N] (an index into PARTS); cameras: V views of it; up: [3];
+    """A made scene. scene: splats with the extra "part" [N] (an index into PARTS); cameras: V views of it;
     light: what it is lit by; things: what instructions can name; seed: it was made from."""
 
     scene: Gaussians
@@ -99,9 +100,9 @@ def solids(rows: Sequence[tuple]) -> list[Solid]:
 
 
 def carve(
-    parts: Sequence[Solid], stone: Tensor, seed: int, light: Light, spacing: float = 0.028
+    parts: Sequence[Solid], stone: Float[Tensor, " 3"], seed: int, light: Light, spacing: float = 0.028
 ) -> tuple[Gaussians, list[Solid]]:
-    """Ellipsoids of one speckled stone of colour [3]; the same solids with their rows, counted from 0."""
+    """Ellipsoids of one speckled stone of that colour; the same solids with their rows, counted from 0."""
     made, placed, first = [], [], 0
     for part in parts:
         fine = spacing * (0.55 if part.name in ("eye", "nose") else 0.8 if part.name in ("ear", "muzzle") else 1.0)
@@ -180,7 +181,7 @@ def make_world(name: str, where: str = "data.source", **options) -> World:
     return WORLDS.get(kind, where)(**options, **({"seed": int(seed)} if colon else {}))
 
 
-def part_mask(scene: Gaussians, *names: str) -> Tensor:
-    """Which splats belong to one of the named parts, bool [N]."""
+def part_mask(scene: Gaussians, *names: str) -> Bool[Tensor, " N"]:
+    """Which splats belong to one of the named parts."""
     wanted = torch.tensor([PARTS.index(choose("part", name, PARTS)) for name in names])
     return torch.isin(scene.extra["part"].long(), wanted)

@@ -47,7 +47,7 @@ class WorldTruth(ClosedForm):
         return other
 
     def embed(self, prompts: Sequence[str]) -> list[Instruction | None]:
-        """Any instruction: it asks for the edit whose truth the prior was told. None, the identity, for an empty one."""
+        """Any instruction: it asks for the edit whose truth was told. None, the identity, for an empty one."""
         return [_instruction(prompt) if prompt.strip() else None for prompt in prompts]
 
     @torch.no_grad()

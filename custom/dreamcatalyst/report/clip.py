@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from ..diffusion.hub import find_folder, load, load_processor, model_config
@@ -21,11 +22,16 @@ EXAMPLE, HOLDS = "openai/clip-vit-large-patch14", "config.json, weights and toke
 MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # of OpenAI's CLIP, RGB
 
 
-def clip_direction(source: Tensor, edited: Tensor, source_text: Tensor, target_text: Tensor) -> Tensor:
+def clip_direction(
+    source: Float[Tensor, "B D"],
+    edited: Float[Tensor, "B D"],
+    source_text: Float[Tensor, "*#B D"],
+    target_text: Float[Tensor, "*#B D"],
+) -> Float[Tensor, " B"]:
     """CLIP directional similarity: the cosine between the way from source to edit and the way from text to text.
 
-    source, edited [B,D]: embeddings of images; source_text, target_text [D] or [B,D]: of their descriptions; of any
-    length, they are normalised here. Returns [B] in [-1,1] with its sign: an edit that goes the opposite way is
+    source, edited: embeddings of images; source_text, target_text ([D] or [B,D]): of their descriptions; of any
+    length, they are normalised here. In [-1,1] with its sign: an edit that goes the opposite way is
     negative, one that changes nothing 0. Source: Gal et al. 2022, StyleGAN-NADA, equation 2, without its 1 - cosine.
     """
     start, end, word, words = (F.normalize(each, dim=-1) for each in (source, edited, source_text, target_text))
@@ -58,8 +64,8 @@ class Clip:
         return load_processor(CLIPTokenizer, self.path, "vocab.json and merges.txt")
 
     @torch.no_grad()
-    def images(self, images: Tensor) -> Tensor:
-        """Embeddings [B,D] of unit length of images [B,H,W,3] in [0,1] (clamped).
+    def images(self, images: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B D"]:
+        """Embeddings of unit length of images in [0,1] (clamped).
 
         Stretched to the model's square, bicubic, without a crop: as the metrics of Instruct-NeRF2NeRF, GaussianEditor
         and DreamCatalyst's code do, so that figures can be compared.
@@ -71,8 +77,8 @@ class Clip:
         return F.normalize(self._model.visual_projection(seen), dim=-1)
 
     @torch.no_grad()
-    def texts(self, texts: Sequence[str]) -> Tensor:
-        """Embeddings [B,D] of unit length of descriptions; no template is put around them."""
+    def texts(self, texts: Sequence[str]) -> Float[Tensor, "B D"]:
+        """Embeddings of unit length of descriptions; no template is put around them."""
         given = self._tokenizer(list(texts), padding=True, truncation=True, return_tensors="pt").to(self.device)
         read = self._model.text_model(input_ids=given.input_ids, attention_mask=given.attention_mask).pooler_output
         return F.normalize(self._model.text_projection(read), dim=-1)
@@ -113,15 +119,15 @@ class Aesthetic:
             )
 
     @torch.no_grad()
-    def __call__(self, embeddings: Tensor) -> Tensor:
-        """Scores [B] of image embeddings [B,D]."""
+    def __call__(self, embeddings: Float[Tensor, "B D"]) -> Float[Tensor, " B"]:
+        """Scores of image embeddings."""
         x = F.normalize(embeddings.float(), dim=-1).cpu()
         for weight, bias in self.layers:
             x = F.linear(x, weight, bias)
         return x[:, 0]
 
 
-def _read(file: Path) -> dict[str, Tensor]:
+def _read(file: Path) -> dict[str, Shaped[Tensor, ...]]:
     if file.suffix == ".safetensors":
         from safetensors.torch import load_file
 
@@ -142,8 +148,8 @@ class ClipJudge:
         self.clip, self.words = Clip(path, device), (source, target) if source.strip() else None
         self.aesthetic = Aesthetic(aesthetic, self.clip.width) if aesthetic else None
 
-    def __call__(self, source: Tensor, edited: Tensor) -> list[dict[str, float]]:
-        """The scores of every view: source, edited [B,H,W,3] in [0,1]. clip_similarity: the cosine between both;
+    def __call__(self, source: Float[Tensor, "B H W 3"], edited: Float[Tensor, "B H W 3"]) -> list[dict[str, float]]:
+        """The scores of every view: source, edited in [0,1]. clip_similarity: the cosine between both;
         clip_direction: `clip_direction`; aesthetic and aesthetic_source: LAION's scores of both."""
         before, after = self.clip.images(source), self.clip.images(edited)
         scores = {"clip_similarity": F.cosine_similarity(before, after, dim=-1)}

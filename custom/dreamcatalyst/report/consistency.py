@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..data.camera import Cameras
@@ -14,8 +15,8 @@ SOLID = 0.5  # least alpha of a pixel that shows a surface
 LEAST = 0.01  # a pair of views that shares a smaller part of the picture says nothing
 
 
-def lifted(depth: Tensor, camera: Cameras) -> Tensor:
-    """The points [H,W,3] in the world that the pixels of one view show. depth [H,W,1]: z in the camera, world units."""
+def lifted(depth: Float[Tensor, "H W 1"], camera: Cameras) -> Float[Tensor, "H W 3"]:
+    """The points in the world that the pixels of one view show. depth: z in the camera, world units."""
     y, x = torch.meshgrid(
         torch.arange(camera.height, dtype=depth.dtype, device=depth.device) + 0.5,
         torch.arange(camera.width, dtype=depth.dtype, device=depth.device) + 0.5,
@@ -26,8 +27,10 @@ def lifted(depth: Tensor, camera: Cameras) -> Tensor:
     return (rays * depth - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 
-def looked_up(points: Tensor, other: Render, camera: Cameras) -> tuple[Tensor, Tensor]:
-    """The colours [H,W,3] that another view shows at `points` [H,W,3], and which of these it sees, bool [H,W]: in front
+def looked_up(
+    points: Float[Tensor, "H W 3"], other: Render, camera: Cameras
+) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+    """The colours that another view shows at `points`, and which of these it sees: in front
     of it, inside of its picture, solid there, and not behind what it shows."""
     viewmat = camera.viewmats[0].to(points)
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]

@@ -7,12 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..loss.image import ssim_map
 from ..registry import Registry
 
 METRICS = Registry("metric", __package__)
+Images, Values = Float[Tensor, "B H W 3"], Float[Tensor, "B H W C"]
+Weight, Means = Float[Tensor, "B H W 1"], Float[Tensor, " B"]
+Pixels = Callable[[Images, Images], Values]
 
 
 @dataclass(frozen=True)
@@ -20,8 +24,8 @@ class Metric:
     """A measure of an image against a reference that is a mean over pixels.
 
     name: of its columns, "<name>_<reference>". title, unit: for people. better: "higher" or "lower". identity: its
-    value where image and reference are equal. pixels: (image, reference) [B,H,W,3] to a value for each pixel,
-    [B,H,W,C]; finish: from their mean to the measure. costly: while a run goes, only against the first reference.
+    value where image and reference are equal. pixels: (image, reference) to a value for each pixel;
+    finish: from their mean to the measure. costly: while a run goes, only against the first reference.
     """
 
     name: str
@@ -29,19 +33,19 @@ class Metric:
     unit: str
     better: str
     identity: float
-    pixels: Callable[[Tensor, Tensor], Tensor]
-    finish: Callable[[Tensor], Tensor] | None = None
+    pixels: Pixels
+    finish: Callable[[Means], Means] | None = None
     costly: bool = False
 
     def label(self, what: str) -> str:
         """`what`, and the unit."""
         return f"{what}, {self.unit}" if self.unit else what
 
-    def __call__(self, image: Tensor, reference: Tensor, weight: Tensor | None = None) -> Tensor:
-        """image, reference [B,H,W,3] in [0,1]; weight [B,H,W,1] in [0,1] or None for all pixels. Returns [B]."""
+    def __call__(self, image: Images, reference: Images, weight: Weight | None = None) -> Means:
+        """image, reference in [0,1]; weight in [0,1], or None for all pixels."""
         return self.over(image, reference, [weight])[0]
 
-    def over(self, image: Tensor, reference: Tensor, weights: Sequence[Tensor | None]) -> list[Tensor]:
+    def over(self, image: Images, reference: Images, weights: Sequence[Weight | None]) -> list[Means]:
         """The measure under each of several weights, at the price of one."""
         values = self.pixels(image, reference)
         means = [_mean(values, weight) for weight in weights]
@@ -55,15 +59,15 @@ def metric(
     identity: float,
     title: str = "",
     unit: str = "",
-    finish: Callable[[Tensor], Tensor] | None = None,
+    finish: Callable[[Means], Means] | None = None,
     costly: bool = False,
-) -> Callable[[Callable[[Tensor, Tensor], Tensor]], Metric]:
+) -> Callable[[Pixels], Metric]:
     """Register a function of pixels under `name`; see Metric. title: the name, if empty. Raises ValueError for a name
     that is taken or cannot begin a column's ("_" ends it), and for another direction than higher and lower."""
     if better not in ("higher", "lower") or "_" in name:
         raise ValueError(f"metric '{name}': better is '{better}', expected higher or lower; the name holds no '_'")
 
-    def add(pixels: Callable[[Tensor, Tensor], Tensor]) -> Metric:
+    def add(pixels: Pixels) -> Metric:
         row = Metric(name, title or name, unit, better, identity, pixels, finish, costly)
         METRICS.add(name, row)
         return row
@@ -71,8 +75,8 @@ def metric(
     return add
 
 
-def _mean(value: Tensor, weight: Tensor | None) -> Tensor:
-    """Mean over pixels and channels of [B,H,W,C], weighted if a weight is given (NaN where it is zero throughout)."""
+def _mean(value: Values, weight: Weight | None) -> Means:
+    """Mean over pixels and channels, weighted if a weight is given (NaN where it is zero throughout)."""
     if weight is None:
         return value.flatten(1).mean(1)
     weight = weight.expand_as(value).flatten(1)
@@ -82,35 +86,38 @@ def _mean(value: Tensor, weight: Tensor | None) -> Tensor:
 @metric(
     "psnr", title="PSNR", unit="dB", better="higher", identity=math.inf, finish=lambda mean: -10 * torch.log10(mean)
 )
-def psnr(image: Tensor, reference: Tensor) -> Tensor:
+def psnr(image: Images, reference: Images) -> Values:
     """Peak signal-to-noise ratio for a peak of 1; infinite where the images are equal."""
     return (image - reference) ** 2
 
 
 @metric("ssim", title="SSIM", better="higher", identity=1.0, costly=True)
-def ssim(image: Tensor, reference: Tensor) -> Tensor:
+def ssim(image: Images, reference: Images) -> Values:
     """Structural similarity (Wang et al. 2004), 1 for equal images."""
     return ssim_map(image, reference)
 
 
 @metric("l1", title="L1", better="lower", identity=0.0)
-def l1(image: Tensor, reference: Tensor) -> Tensor:
+def l1(image: Images, reference: Images) -> Values:
     """Mean absolute difference."""
     return (image - reference).abs()
 
 
 def compare(
-    image: Tensor, references: Mapping[str, Tensor], region: Tensor | None = None, brief: bool = False
+    image: Float[Tensor, "H W 3"],
+    references: Mapping[str, Float[Tensor, "H W 3"]],
+    region: Float[Tensor, "H W 1"] | None = None,
+    brief: bool = False,
 ) -> dict[str, float]:
-    """Every metric of a picture [H,W,3] in [0,1] against each reference, as "<metric>_<reference>".
+    """Every metric of a picture in [0,1] against each reference, as "<metric>_<reference>".
 
-    region [H,W,1] of 0 and 1: where the picture is meant to change. With it also "<metric>_source_outside", against the
+    region of 0 and 1: where the picture is meant to change. With it also "<metric>_source_outside", against the
     source where nothing should have changed (the drift), and "<metric>_<reference>_inside" against all others. A
     region without a pixel in this view has no score. brief: costly metrics against the first reference only.
     """
     scores = {}
     for name, reference in references.items():
-        weights: dict[str, Tensor | None] = {name: None}
+        weights: dict[str, Weight | None] = {name: None}
         if region is not None:
             where, weight = ("outside", 1 - region) if name == "source" else ("inside", region)
             if bool(weight.any()):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 from torch import Tensor
 
 from ..files import write_text
@@ -66,15 +67,15 @@ class Table:
 
 @dataclass(frozen=True)
 class Page:
-    """What stands on a page, from top to bottom. tiles: label to value. pictures: a row of labelled pictures [H,W,3] in
-    [0,1] for each view, of which the first two are before and after. charts: those of `chart.line_chart`.
+    """What stands on a page, from top to bottom. tiles: label to value. pictures: a row of labelled pictures in [0,1]
+    for each view, of which the first two are before and after. charts: those of `chart.line_chart`.
     stages: seconds by stage. notice: what a reader must know of the figures. texts: headings to what stands below them,
     folded up."""
 
     title: str
     subtitle: str
     tiles: Mapping[str, str] = field(default_factory=dict)
-    pictures: Sequence[Sequence[tuple[str, Tensor]]] = ()
+    pictures: Sequence[Sequence[tuple[str, Float[Tensor, "H W 3"]]]] = ()
     charts: Sequence[str] = ()
     stages: Mapping[str, float] = field(default_factory=dict)
     tables: Mapping[str, Table] = field(default_factory=dict)
@@ -108,8 +109,8 @@ class Page:
         return write_text(path, self.html())
 
 
-def data_uri(image: Tensor, quality: int = 90) -> str:
-    """A picture [H,W,3] in [0,1] as a JPEG inside an address."""
+def data_uri(image: Float[Tensor, "H W 3"], quality: int = 90) -> str:
+    """A picture in [0,1] as a JPEG inside an address."""
     _, encoded = cv2.imencode(
         ".jpg", np.ascontiguousarray(to_uint8(image)[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from .clock import LOGGING, OTHER, Clock
@@ -26,7 +27,7 @@ class Record:
         self.numbers: dict[str, float] = {}  # of the latest step
         self.skipped = 0  # steps that were left out because something in them was not finite
         self._cost, self._measured = 0.0, 0  # seconds and step of the latest measurement
-        self._seen: tuple[float, dict[int, Tensor]] | None = None  # the seconds and the pictures of it
+        self._seen: tuple[float, dict[int, Float[Tensor, "H W 3"]]] | None = None  # the seconds and the pictures of it
 
     def begin(self, run: RunFacts, last: int) -> None:
         """Start the clock, and of a new run, add the row of step 0. last: step at which the run ends."""

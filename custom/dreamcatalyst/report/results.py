@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from ..data.orbit import video_path
 from .pictures import picture_row, write_png, write_video
@@ -23,7 +24,7 @@ def write_video_along(run: RunFacts, path: Path) -> Path | None:
         return None
     cameras = video_path(run.capture.training_cameras, run.config.video_frames)
 
-    def frames() -> Iterator[np.ndarray]:
+    def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         for i in range(len(cameras)):
             panels = run.frame(cameras[i])
             row = picture_row(panels)

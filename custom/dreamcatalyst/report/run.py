@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+from jaxtyping import Float
 from omegaconf import OmegaConf
 from torch import Tensor, device
 
@@ -18,7 +19,7 @@ from ..render.api import Render
 from .clip import ClipJudge
 from .metrics import compare
 
-Panels = list[tuple[str, Tensor]]  # labelled pictures [H,W,3] in [0,1], side by side in what is written
+Panels = list[tuple[str, Float[Tensor, "H W 3"]]]  # labelled pictures in [0,1], side by side in what is written
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ class RunFacts:
     scenes: the splats of the moment under "", and others by name to compare their consistency with.
     plan: what the run builds, in words; empty before training.
     draw: (scene, cameras, **options of `rasterize`) to a Render. picture: index of a view to its present render
-    [H,W,3] in [0,1]. references: index to what it is compared with, by name, the aim first. region: index to where a
-    view is meant to change, [H,W,1] of 0 and 1, or None. panels: index to labelled pictures. frame: a camera to the
+    in [0,1]. references: index to what it is compared with, by name, the aim first. region: index to where a
+    view is meant to change, of 0 and 1, or None. panels: index to labelled pictures. frame: a camera to the
     labelled pictures of a moment of the video. judge: CLIP's scores, if any. counts: further numbers for the page, by
     what they count.
     """
@@ -76,9 +77,9 @@ class RunFacts:
     plan: str
     scenes: Callable[[], Mapping[str, Any]]
     draw: Callable[..., Render]
-    picture: Callable[[int], Tensor]
-    references: Callable[[int], Mapping[str, Tensor]]
-    region: Callable[[int], Tensor | None]
+    picture: Callable[[int], Float[Tensor, "H W 3"]]
+    references: Callable[[int], Mapping[str, Float[Tensor, "H W 3"]]]
+    region: Callable[[int], Float[Tensor, "H W 1"] | None]
     panels: Callable[[int], Panels]
     frame: Callable[[Cameras], Panels]
     judge: ClipJudge | None
@@ -95,7 +96,7 @@ class RunFacts:
         whole = self.folder / "configs" / "parsed.yaml"
         return whole.read_text(encoding="utf-8") if whole.is_file() else OmegaConf.to_yaml(self.settings)
 
-    def score(self, index: int, image: Tensor | None = None, brief: bool = False) -> dict[str, float]:
+    def score(self, index: int, image: Float[Tensor, "H W 3"] | None = None, brief: bool = False) -> dict[str, float]:
         """Metrics of one view against each of its references (`metrics.compare`). image: the picture of the view,
         where it is there already."""
         image = self.picture(index) if image is None else image

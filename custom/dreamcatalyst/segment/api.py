@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from ..config import AtLeastOne, NonNegative, PositiveFraction, parse
@@ -69,7 +70,7 @@ class MaskRequest:
 
     scene: N splats. cameras: one batch of one per view of the capture, names: theirs; views: numbers of the views that
     may be looked at (those of training). extent: of the scene, world units, as `Capture.extent`. render: number of a
-    view to its source render [H,W,3]. guidance: for kinds that ask the prior. prompt: the instruction.
+    view to its source render. guidance: for kinds that ask the prior. prompt: the instruction.
     backend, antialiased, background: how `render` draws. origin: the point of the user's world that is (0,0,0) here.
     """
 
@@ -78,7 +79,7 @@ class MaskRequest:
     names: Sequence[str]
     views: Sequence[int]
     extent: float
-    render: Callable[[int], Tensor]
+    render: Callable[[int], Float[Tensor, "H W 3"]]
     guidance: Guidance | None = None
     prompt: str = ""
     backend: str = "auto"
@@ -97,9 +98,11 @@ class Segmenter(ABC):
     """One kind of mask: a frozen dataclass whose fields are its options. Paths and prompts are in them."""
 
     @abstractmethod
-    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor] | Tensor:
-        """Number of a view to its mask [H,W] in [0,1], for some or all of `views` (or others that the options name);
-        or, where no picture is needed, weights of the splats [N] in [0,1]."""
+    def __call__(
+        self, request: MaskRequest, views: Sequence[int]
+    ) -> dict[int, Float[Tensor, "H W"]] | Float[Tensor, " N"]:
+        """Number of a view to its mask in [0,1], for some or all of `views` (or others that the options name);
+        or, where no picture is needed, weights of the splats in [0,1]."""
 
     def identity(self, request: MaskRequest) -> Any:
         """What the result depends on beside the options, the request's splats, cameras and renders."""
@@ -108,14 +111,14 @@ class Segmenter(ABC):
 
 @dataclass(frozen=True)
 class Mask:
-    """weights [N] in [0,1]: how much of each splat is meant, before the threshold, and inverted where that was asked;
-    mask [N] bool: the splats that may change; update [N]: by which fraction of a step, 0 outside of the mask.
-    images: the pictures it was made of, number of a view to [H,W] in [0,1] in steps of 1/255; none for 3D boxes."""
+    """weights in [0,1]: how much of each splat is meant, before the threshold, and inverted where that was asked;
+    mask: the splats that may change; update: by which fraction of a step, 0 outside of the mask.
+    images: the pictures it was made of, number of a view to one in [0,1], in steps of 1/255; none for 3D boxes."""
 
-    weights: Tensor
-    mask: Tensor
-    update: Tensor
-    images: dict[int, Tensor]
+    weights: Float[Tensor, " N"]
+    mask: Bool[Tensor, " N"]
+    update: Float[Tensor, " N"]
+    images: dict[int, Float[Tensor, "H W"]]
 
 
 def make_mask(config: MaskConfig, request: MaskRequest, folder: Path | None = None) -> Mask | None:
@@ -152,8 +155,10 @@ def _made_of(config: MaskConfig, segmenter: Segmenter, request: MaskRequest) -> 
     return dict(request.scene.parameters()), cameras, seen, carried, segmenter, segmenter.identity(request)
 
 
-def _find(config: MaskConfig, segmenter: Segmenter, request: MaskRequest) -> tuple[Tensor, dict[int, Tensor]]:
-    """Weights [N] and the pictures that they come from, uint8 [H,W]."""
+def _find(
+    config: MaskConfig, segmenter: Segmenter, request: MaskRequest
+) -> tuple[Float[Tensor, " N"], dict[int, UInt8[Tensor, "H W"]]]:
+    """Weights and the pictures that they come from."""
     found = segmenter(request, request.spread(config.views))
     if isinstance(found, Tensor):
         return found, {}
@@ -172,8 +177,8 @@ def _find(config: MaskConfig, segmenter: Segmenter, request: MaskRequest) -> tup
     return weights, images
 
 
-def sum_evidence(config: MaskConfig, request: MaskRequest, images: dict[int, Tensor]) -> Evidence:
-    """What uint8 pictures [H,W] by number of view say of the splats, by the vote that the config names."""
+def sum_evidence(config: MaskConfig, request: MaskRequest, images: dict[int, UInt8[Tensor, "H W"]]) -> Evidence:
+    """What pictures by number of view say of the splats, by the vote that the config names."""
     zeros = request.scene.means.new_zeros(len(request.scene))
     evidence = Evidence(zeros, zeros)
     for view, image in images.items():

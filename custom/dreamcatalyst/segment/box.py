@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..config import NonNegative, Number, Positive
@@ -47,10 +48,12 @@ class Box(Segmenter):
         if self.window and not (self.window[0] < self.window[2] and self.window[1] < self.window[3]):
             raise ConfigError(f"window: got {self.window}, expected left < right and top < bottom.")
 
-    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor] | Tensor:
+    def __call__(
+        self, request: MaskRequest, views: Sequence[int]
+    ) -> dict[int, Float[Tensor, "H W"]] | Float[Tensor, " N"]:
         means = request.scene.means.detach()
 
-        def here(point: tuple[float, float, float]) -> Tensor:
+        def here(point: tuple[float, float, float]) -> Float[Tensor, " 3"]:
             return means.new_tensor([a - b for a, b in zip(point, request.origin, strict=True)])
 
         if self.low and self.high:
@@ -65,8 +68,8 @@ class Box(Segmenter):
         view = cast(str, self.view)  # there is one where there is no box and no sphere
         return view_number(view, request.names, "system.mask.options.view")
 
-    def rectangle(self, width: int, height: int) -> Tensor:
-        """The window as a mask [height,width]; a pixel that is cut counts by the part that lies inside."""
+    def rectangle(self, width: int, height: int) -> Float[Tensor, "{height} {width}"]:
+        """The window as a mask; a pixel that is cut counts by the part that lies inside."""
         left, top, right, bottom = window = cast(Window, self.window)  # it comes with the view
         if max(window) <= 1:
             left, top, right, bottom = left * width, top * height, right * width, bottom * height

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from .. import files, plugin
@@ -22,12 +23,14 @@ def code() -> str:
     return digest([(p.name, p.read_bytes()) for place in PLACES for p in sorted((root / place).glob("*.py"))])
 
 
-def save(folder: Path, key: str, weights: Tensor, images: Mapping[int, Tensor]) -> None:
-    """Keep weights [N] and pictures (number of a view to uint8 [H,W]). Raises FileError."""
+def save(folder: Path, key: str, weights: Float[Tensor, " N"], images: Mapping[int, UInt8[Tensor, "H W"]]) -> None:
+    """Keep weights and pictures (by number of a view). Raises FileError."""
     files.save(folder / f"{key}.pt", {"key": key, "weights": weights.cpu(), "images": dict(images)})
 
 
-def load(folder: Path, key: str, count: int) -> tuple[Tensor, dict[int, Tensor]] | None:
+def load(
+    folder: Path, key: str, count: int
+) -> tuple[Float[Tensor, " {count}"], dict[int, UInt8[Tensor, "H W"]]] | None:
     """What `save` kept under `key` of `count` splats; None where there is nothing. A file that is not to the bit what
     was written, or not what its name says, is reported and left aside, to be written anew."""
     path = folder / f"{key}.pt"

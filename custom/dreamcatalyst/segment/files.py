@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from ..errors import ConfigError, DataError, nearest
@@ -32,7 +33,7 @@ class Files(Segmenter):
         if not self.folder:
             raise ConfigError("folder: is empty. Name the folder that holds one PNG per view.")
 
-    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor]:
+    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Float[Tensor, "H W"]]:
         masks = {}
         for view, path in self.paths(request).items():
             camera = request.cameras[view]
@@ -72,8 +73,8 @@ def _lacking(folder: Path, lacking: list[str], taken: set[Path], wanted: int) ->
     )
 
 
-def read_mask(path: Path, width: int, height: int) -> np.ndarray:
-    """A picture as float32 [height,width] in [0,1]. Raises DataError: not a picture, or of another shape."""
+def read_mask(path: Path, width: int, height: int) -> Float32[np.ndarray, "{height} {width}"]:
+    """A picture in [0,1]. Raises DataError: not a picture, or of another shape."""
     try:
         image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     except (OSError, cv2.error):  # such as an empty file

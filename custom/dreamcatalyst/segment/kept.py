@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import SceneError
@@ -15,8 +16,8 @@ from .api import EXTRA, MaskRequest, Segmenter
 class Kept(Segmenter):
     """Edit after edit in one place: soft weights travel with the splats, also with those that were added."""
 
-    def __call__(self, request: MaskRequest, views: Sequence[int]) -> Tensor:
-        """Weights [N]. Raises SceneError where the splats carry none."""
+    def __call__(self, request: MaskRequest, views: Sequence[int]) -> Float[Tensor, " N"]:
+        """Their weights. Raises SceneError where the splats carry none."""
         if EXTRA not in request.scene.extra:
             known = ", ".join(request.scene.extra) or "none"
             raise SceneError(
@@ -25,5 +26,5 @@ class Kept(Segmenter):
             )
         return request.scene.extra[EXTRA].to(request.scene.means).reshape(-1).clamp(0, 1)
 
-    def identity(self, request: MaskRequest) -> Tensor | None:
+    def identity(self, request: MaskRequest) -> Float[Tensor, "N ..."] | None:
         return request.scene.extra.get(EXTRA)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..render.api import rasterize
@@ -11,15 +12,17 @@ from .api import Mask, MaskRequest
 TINT = (1.0, 0.15, 0.1)  # of what may change
 
 
-def overlay(image: Tensor, mask: Tensor, strength: float = 0.5) -> Tensor:
-    """`image` [H,W,3] in [0,1], tinted red where `mask` [H,W] in [0,1] is on and darkened by a third elsewhere."""
+def overlay(image: Float[Tensor, "H W 3"], mask: Float[Tensor, "H W"], strength: float = 0.5) -> Float[Tensor, "H W 3"]:
+    """`image` in [0,1], tinted red where `mask` in [0,1] is on and darkened by a third elsewhere."""
     weight = strength * mask[..., None].to(image)
     return image.clamp(0, 1) * (1 - weight) * (2 + mask[..., None].to(image)) / 3 + weight * image.new_tensor(TINT)
 
 
 @torch.no_grad()
-def rendered_mask(mask: Tensor, request: MaskRequest, view: int) -> Tensor:
-    """A mask of splats [N] as one view sees it, [H,W] in [0,1]."""
+def rendered_mask(
+    mask: Bool[Tensor, " N"] | Float[Tensor, " N"], request: MaskRequest, view: int
+) -> Float[Tensor, "H W"]:
+    """A mask of splats as one view sees it, in [0,1]."""
     seen = rasterize(
         request.scene,
         request.cameras[view],
@@ -31,8 +34,8 @@ def rendered_mask(mask: Tensor, request: MaskRequest, view: int) -> Tensor:
     return seen.features[0, ..., 0]
 
 
-def mask_panels(found: Mask, request: MaskRequest, view: int) -> list[tuple[str, Tensor]]:
-    """Labelled pictures [H,W,3] of one view, for report/pictures.py: the source, the picture that the segmenter gave
+def mask_panels(found: Mask, request: MaskRequest, view: int) -> list[tuple[str, Float[Tensor, "H W 3"]]]:
+    """Labelled pictures of one view, for report/pictures.py: the source, the picture that the segmenter gave
     (where there is one of this view), and the splats that may change."""
     image = request.render(view)
     panels = [("source", image)]

@@ -14,10 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from .. import plugin
 from ..config import AtLeastOne, Between, Fraction, NonNegative, PositiveFraction, Seed
+from ..data.camera import Cameras
 from ..diffusion.api import Row
 from ..diffusion.noise import abar_at, add_noise, keyed_noise
 from ..errors import ConfigError, PriorError, choose
@@ -32,17 +34,17 @@ FENCE = 1.5  # interquartile ranges beyond the quartiles, from where on values a
 
 @dataclass(frozen=True)
 class Answer:
-    """Of one view, each [h,w] of latents in units of the prior's predicted noise. relevance: mean over channels, draws
+    """Of one view's latents, in units of the prior's predicted noise. relevance: mean over channels, draws
     and levels of the difference |eps(text, image) - eps(no text, image)|. signal: root mean square over channels and
     levels of what is the same in all draws. noise: of what differs from draw to draw, NaN where there was one draw."""
 
-    relevance: Tensor
-    signal: Tensor
-    noise: Tensor
+    relevance: Float[Tensor, "h w"]
+    signal: Float[Tensor, "h w"]
+    noise: Float[Tensor, "h w"]
 
     @classmethod
-    def of(cls, apart: Tensor) -> Answer:
-        """From differences of predictions [T,D,C,h,w] at T levels with D draws."""
+    def of(cls, apart: Float[Tensor, "T D C h w"]) -> Answer:
+        """From differences of predictions at T levels with D draws."""
         one = apart.shape[1] == 1
         variance = torch.full_like(apart[:, 0], torch.nan) if one else apart.var(dim=1)  # of a single draw
         signal = apart.mean(dim=1).square() - variance / apart.shape[1]  # without what the mean of noise adds
@@ -72,7 +74,7 @@ class Relevance(Segmenter):
         if self.lowest > self.highest:
             raise ConfigError(f"lowest, highest: got {self.lowest} and {self.highest}, expected lowest <= highest.")
 
-    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor]:
+    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Float[Tensor, "H W"]]:
         guidance = _guidance(request)
         first = views[:: math.ceil(len(views) / DECIDING)]
         asked = {view: self.ask(guidance, request.render(view), view, max(self.draws, 2)) for view in first}
@@ -110,8 +112,8 @@ class Relevance(Segmenter):
         return request.prompt, type(prior).__qualname__, prior.config, stamp(getattr(prior.config, "path", None))
 
     @torch.no_grad()
-    def ask(self, guidance: Guidance, source: Tensor, view: int, draws: int) -> Answer:
-        """How the prediction for a source render [H,W,3] differs with the instruction from without, over `draws` noise
+    def ask(self, guidance: Guidance, source: Float[Tensor, "H W 3"], view: int, draws: int) -> Answer:
+        """How the prediction for a source render differs with the instruction from without, over `draws` noise
         draws per level."""
         prior, (latents, condition) = guidance.prior, guidance.encode_source(source, view)
         shape, kind = latents.shape[1:], (latents.dtype, latents.device)
@@ -128,8 +130,8 @@ class Relevance(Segmenter):
             apart.append((with_text - without).float().unflatten(0, (-1, draws)).mean(dim=0))  # over both signs
         return Answer.of(torch.stack(apart))
 
-    def mask(self, relevance: Tensor, camera: Any) -> Tensor:
-        """Normalised relevance [h,w] of latents as a mask [H,W] in [0,1] of the size of the view."""
+    def mask(self, relevance: Float[Tensor, "h w"], camera: Cameras) -> Float[Tensor, "H W"]:
+        """Normalised relevance of latents as a mask in [0,1] of the size of the view."""
         height, width = camera.height, camera.width
         factor = math.ceil(height / relevance.shape[0])  # latents may reach beyond the image on the right and below
         size = relevance.shape[1] * factor, relevance.shape[0] * factor
@@ -146,12 +148,12 @@ def _guidance(request: MaskRequest) -> Guidance:
     return request.guidance
 
 
-def pooled(maps: Iterable[Tensor]) -> np.ndarray:
+def pooled(maps: Iterable[Float[Tensor, "h w"]]) -> Float[np.ndarray, " values"]:
     """The values of all views. For numpy's quantiles, which take any number of values; torch.quantile only 2^24."""
     return np.concatenate([m.cpu().numpy().ravel() for m in maps])
 
 
-def normalised(maps: dict[int, Tensor]) -> dict[int, Tensor]:
+def normalised(maps: dict[int, Float[Tensor, "h w"]]) -> dict[int, Float[Tensor, "h w"]]:
     """Relevance of all views together to [0,1]: what lies more than 1.5 interquartile ranges beyond the quartiles is
     clipped, and the rest stretched from its least to its greatest.
 

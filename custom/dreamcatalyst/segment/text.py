@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ..config import Between
@@ -51,7 +52,7 @@ class Text(Segmenter):
     def identity(self, request: MaskRequest) -> Any:
         return stamp(self.path), stamp(self.sam)
 
-    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Tensor]:
+    def __call__(self, request: MaskRequest, views: Sequence[int]) -> dict[int, Float[Tensor, "H W"]]:
         finder = MODELS[model_type(self.path, *MODELS)](self, request.scene.means.device)
         masks = {view: finder(request.render(view).detach().clamp(0, 1)) for view in views}
         if not any(bool(mask.any()) for mask in masks.values()):
@@ -63,7 +64,7 @@ class Text(Segmenter):
 
 
 class ClipSeg:
-    """[H,W,3] in [0,1] to a mask [H,W] of 0 and 1: pixels whose probability for any phrase is over the threshold."""
+    """A picture in [0,1] to a mask of 0 and 1: pixels whose probability for any phrase is over the threshold."""
 
     def __init__(self, options: Text, device: torch.device):
         from transformers import AutoProcessor, CLIPSegForImageSegmentation
@@ -73,7 +74,7 @@ class ClipSeg:
         self.model = load(CLIPSegForImageSegmentation, options.path, None, torch.float32).to(device)
 
     @torch.no_grad()
-    def __call__(self, image: Tensor) -> Tensor:
+    def __call__(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
         inputs = self.processor(
             text=self.phrases, images=[_pixels(image)] * len(self.phrases), padding=True, return_tensors="pt"
         ).to(self.model.device)
@@ -85,7 +86,7 @@ class ClipSeg:
 
 
 class GroundedSam:
-    """[H,W,3] in [0,1] to a mask [H,W] of 0 and 1: Grounding DINO's boxes over the threshold, each cut out by SAM."""
+    """A picture in [0,1] to a mask of 0 and 1: Grounding DINO's boxes over the threshold, each cut out by SAM."""
 
     def __init__(self, options: Text, device: torch.device):
         from transformers import AutoProcessor, GroundingDinoForObjectDetection, SamModel
@@ -99,14 +100,14 @@ class GroundedSam:
         self.detector = load(GroundingDinoForObjectDetection, options.path, None, torch.float32).to(device)
         self.sam = load(SamModel, options.sam, None, torch.float32).to(device)
 
-    def __call__(self, image: Tensor) -> Tensor:
+    def __call__(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
         pixels = _pixels(image)
         boxes = self.boxes(pixels)
         return self.cut_out(pixels, boxes) if len(boxes) else torch.zeros(image.shape[:2])
 
     @torch.no_grad()
-    def boxes(self, pixels: np.ndarray) -> Tensor:
-        """Left, top, right, bottom in pixels, [B,4], of everything that is found."""
+    def boxes(self, pixels: UInt8[np.ndarray, "H W 3"]) -> Float[Tensor, "B 4"]:
+        """Left, top, right, bottom in pixels of everything that is found."""
         inputs = self.processor(images=pixels, text=self.words, return_tensors="pt").to(self.detector.device)
         found = self.detector(**inputs)
         self.best = max(self.best, float(found.logits.sigmoid().max()))  # of the words that a box answers to best
@@ -116,8 +117,8 @@ class GroundedSam:
         return kept["boxes"]
 
     @torch.no_grad()
-    def cut_out(self, pixels: np.ndarray, boxes: Tensor) -> Tensor:
-        """The union [H,W] of what the boxes [B,4] hold."""
+    def cut_out(self, pixels: UInt8[np.ndarray, "H W 3"], boxes: Float[Tensor, "B 4"]) -> Float[Tensor, "H W"]:
+        """The union of what the boxes hold."""
         inputs = self.sam_processor(images=pixels, input_boxes=[boxes.tolist()], return_tensors="pt")
         sizes = inputs.pop("original_sizes"), inputs.pop("reshaped_input_sizes")
         inputs = {name: value.to(self.sam.device, torch.float32) for name, value in inputs.items()}
@@ -134,6 +135,6 @@ def model_type(path: str, *wanted: str) -> str:
     return model_config(path, HOLDS, {name: EXAMPLES[name] for name in wanted}).model_type
 
 
-def _pixels(image: Tensor) -> np.ndarray:
-    """uint8 [H,W,3] of [H,W,3] in [0,1]."""
+def _pixels(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture in [0,1] in 8 bits."""
     return (image * 255).round().to(torch.uint8).cpu().numpy()
