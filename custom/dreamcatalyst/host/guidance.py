@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from .. import plugin
@@ -105,7 +106,7 @@ class HostGuidance(plugin.BaseObject):
         """The guidance's config at this moment."""
         return replace(self._settings, **self._limits(self._epoch, self._step))
 
-    def __call__(self, rgb: Tensor, *args: Any, **batch: Any) -> Answer:
+    def __call__(self, rgb: Float[Tensor, "B H W 3"], *args: Any, **batch: Any) -> Answer:
         for flag in ("rgb_as_latents", "guidance_eval", "test_info"):
             if batch.get(flag):
                 raise ConfigError(
@@ -121,24 +122,31 @@ class HostGuidance(plugin.BaseObject):
         return Answer(self.answer(guidance, images, sources, views, rgb))
 
     def answer(
-        self, guidance: Guidance, images: Tensor, sources: Tensor | None, views: list[int], rgb: Tensor
+        self,
+        guidance: Guidance,
+        images: Float[Tensor, "B h w 3"],
+        sources: Float[Tensor, "B h w 3"] | None,
+        views: list[int],
+        rgb: Float[Tensor, "B H W 3"],
     ) -> dict[str, Any]:
-        """What the host gets. images, sources [B,h,w,3] at the size at which they are encoded; rgb as it was passed."""
+        """What the host gets. images, sources: at the size at which they are encoded; rgb as it was passed."""
         raise NotImplementedError
 
     # --- images
 
-    def _encoded_size(self, rgb: Tensor) -> tuple[int, ...]:
+    def _encoded_size(self, rgb: Float[Tensor, "B H W 3"]) -> tuple[int, ...]:
         return (self.cfg.fixed_size, self.cfg.fixed_size) if self.cfg.fixed_size > 0 else tuple(rgb.shape[1:3])
 
     @staticmethod
-    def _resized(images: Tensor, size: Sequence[int]) -> Tensor:
+    def _resized(images: Float[Tensor, "B H W 3"], size: Sequence[int]) -> Float[Tensor, "B h w 3"]:
         if tuple(images.shape[1:3]) == tuple(size):
             return images
         resized = F.interpolate(images.permute(0, 3, 1, 2), tuple(size), mode="bilinear", antialias=True)
         return resized.permute(0, 2, 3, 1)
 
-    def _sources(self, args: Sequence[Any], batch: dict[str, Any], images: Tensor) -> Tensor | None:
+    def _sources(
+        self, args: Sequence[Any], batch: dict[str, Any], images: Float[Tensor, "B h w 3"]
+    ) -> Float[Tensor, "_ h w 3"] | None:
         given = next((a for a in args if isinstance(a, Tensor)), batch.get("gt_rgb"))
         if given is None and self._references and "index" in batch:
             given = self._reference(batch["index"])
@@ -163,8 +171,8 @@ class HostGuidance(plugin.BaseObject):
             )
         return found
 
-    def _reference(self, index: int | Tensor) -> Tensor:
-        """The reference images [B,H,W,3] of the views `index`."""
+    def _reference(self, index: int | Shaped[Tensor, ...]) -> Float[Tensor, "B H W 3"]:
+        """The reference images of the views `index`."""
         from PIL import Image
 
         views = torch.as_tensor(index).reshape(-1).tolist()
@@ -195,8 +203,10 @@ class HostGuidance(plugin.BaseObject):
         if len(texts) > 1:
             guidance.source_text = texts[1]
 
-    def _host_text(self, prior: Any, processor: Any, batch: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """Embeddings [B or 1,L,D] of the prompt and of the negative prompt."""
+    def _host_text(
+        self, prior: Any, processor: Any, batch: dict[str, Any]
+    ) -> tuple[Float[Tensor, "B L D"], Float[Tensor, "B L D"]]:
+        """Embeddings (of one row, or of B) of the prompt and of the negative prompt."""
         directed = self.cfg.view_dependent_prompting and "elevation" in batch
         angles = [batch[name] if directed else torch.zeros(1) for name in ("elevation", "azimuth", "camera_distances")]
         rows = processor.get_text_embeddings(*angles, view_dependent_prompting=directed)
@@ -210,8 +220,8 @@ class HostGuidance(plugin.BaseObject):
         return rows.detach().chunk(2)  # the host's order: the rows with text, then those without
 
 
-def content_key(image: Tensor) -> int:
-    """A number for an image [H,W,3], the same for the same pixels: a view's name where the host gives it none."""
+def content_key(image: Float[Tensor, "H W 3"]) -> int:
+    """A number for an image, the same for the same pixels: a view's name where the host gives it none."""
     data = image.detach().float().cpu().contiguous().numpy().tobytes()
     return int.from_bytes(hashlib.blake2b(data, digest_size=7).digest(), "little")
 
@@ -233,7 +243,12 @@ class LossGuidance(HostGuidance):
             )
 
     def answer(
-        self, guidance: Guidance, images: Tensor, sources: Tensor | None, views: list[int], rgb: Tensor
+        self,
+        guidance: Guidance,
+        images: Float[Tensor, "B h w 3"],
+        sources: Float[Tensor, "B h w 3"] | None,
+        views: list[int],
+        rgb: Float[Tensor, "B H W 3"],
     ) -> dict[str, Any]:
         length = self.cfg.max_steps or self.cfg.max_iteration or 1
         given = guidance.step(images, sources, views, self._step, length)
@@ -259,7 +274,7 @@ class EditGuidance(HostGuidance):
         super().configure()
         self._guidance.objective.check_sampler()
 
-    def __call__(self, rgb: Tensor, *args: Any, **batch: Any) -> Answer:
+    def __call__(self, rgb: Float[Tensor, "B H W 3"], *args: Any, **batch: Any) -> Answer:
         if "rgb_as_latents" in batch:  # only systems that want a loss say this, and would go on without any
             raise ConfigError(
                 f"system.guidance_type: this system asks for a loss, got dreamcatalyst-edit-guidance. {WHICH}."
@@ -268,7 +283,12 @@ class EditGuidance(HostGuidance):
 
     @torch.no_grad()
     def answer(
-        self, guidance: Guidance, images: Tensor, sources: Tensor | None, views: list[int], rgb: Tensor
+        self,
+        guidance: Guidance,
+        images: Float[Tensor, "B h w 3"],
+        sources: Float[Tensor, "B h w 3"] | None,
+        views: list[int],
+        rgb: Float[Tensor, "B H W 3"],
     ) -> dict[str, Any]:
         if sources is None:
             raise ConfigError("system.guidance: an edit needs the image that is edited, and this system passes none")

@@ -14,8 +14,10 @@ from ..loss.image import ssim_map
 from ..registry import Registry
 
 METRICS = Registry("metric", __package__)
-Images, Values = Float[Tensor, "B H W 3"], Float[Tensor, "B H W C"]
-Weight, Means = Float[Tensor, "B H W 1"], Float[Tensor, " B"]
+Images = Float[Tensor, "B H W 3"]
+Values = Float[Tensor, "B H W C"]
+Weight = Float[Tensor, "B H W 1"]
+Means = Float[Tensor, " B"]
 Pixels = Callable[[Images, Images], Values]
 
 
