@@ -12,7 +12,7 @@ nothing, is an error.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from importlib import import_module
 from types import SimpleNamespace
@@ -22,7 +22,6 @@ import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
-from torch.utils._pytree import tree_flatten, tree_map
 
 FAR = torch.device("meta")
 aten = torch.ops.aten
@@ -69,6 +68,27 @@ class Far(torch.Tensor):
 def near(value: Any) -> Any:
     """What a far tensor wraps; anything else as it is."""
     return value.near if isinstance(value, Far) else value
+
+
+def away(value: Any) -> Any:
+    """A tensor as a far one; anything else as it is."""
+    return Far(value) if isinstance(value, torch.Tensor) else value
+
+
+def each(function: Callable[[Any], Any], value: Any) -> Any:
+    """What operations take and return (lists and tuples of values at most), with `function` of each value in it."""
+    if isinstance(value, (tuple, list)):
+        return type(value)([each(function, part) for part in value])
+    return function(value)
+
+
+def leaves(values: Iterable[Any]) -> Iterator[Any]:
+    """The values in nested lists and tuples."""
+    for value in values:
+        if isinstance(value, (tuple, list)):
+            yield from leaves(value)
+        else:
+            yield value
 
 
 class Makers(TorchFunctionMode):
@@ -136,7 +156,7 @@ class FarDevice(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
-        packet, operands = func.overloadpacket, tree_flatten((args, kwargs))[0]
+        packet, operands = func.overloadpacket, list(leaves([*args, *kwargs.values()]))
         tensors = [value for value in operands if isinstance(value, torch.Tensor)]
         far = [tensor for tensor in tensors if isinstance(tensor, Far)]
         target = kwargs.pop("device", None)
@@ -152,10 +172,10 @@ class FarDevice(TorchDispatchMode):
             self._wait(reason)
         kwargs.pop("pin_memory", None)
         placed = {"device": "cpu"} if target is not None else {}
-        out = func(*tree_map(near, args), **tree_map(near, kwargs), **placed)
+        out = func(*each(near, args), **{name: each(near, value) for name, value in kwargs.items()}, **placed)
         if not to_far:
             return out
-        out = tree_map(lambda value: Far(value) if isinstance(value, torch.Tensor) else value, out)
+        out = each(away, out)
         if not far or packet in COPIES and packet is not aten.copy_ or not isinstance(out, torch.Tensor):
             return self._same(func, args, out)
         return return_and_correct_aliasing(func, args, kwargs, out)
