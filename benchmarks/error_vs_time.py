@@ -65,7 +65,7 @@ def values_of(config: str, overrides: list[str]) -> dict[str, Any]:
 
 
 def demo_bench(args: argparse.Namespace) -> Bench | str:
-    """The edits of a made world with the small prior; in words, why not."""
+    """The edits of a synthetic scene with the small prior; in words, why not."""
     from dreamcatalyst.diffusion.hub import SHIPPED, SHIPPED_NAME
 
     given = [*ALIKE, *([f"system.guidance.prior.path={Path(args.prior).resolve()}"] if args.prior else [])]
@@ -73,12 +73,12 @@ def demo_bench(args: argparse.Namespace) -> Bench | str:
     values = values_of(config, given)
     guidance = values["system"]["guidance"]
     if guidance["prior_type"] != "ip2p":
-        return f"edits of made worlds: the prior of {args.config} is {guidance['prior_type']}, expected ip2p"
+        return f"edits of synthetic scenes: the prior of {args.config} is {guidance['prior_type']}, expected ip2p"
     if guidance["prior"]["path"] == SHIPPED_NAME and not SHIPPED.is_dir():
-        return f"edits of made worlds: the small model is not in {SHIPPED} (--prior names another folder)"
+        return f"edits of synthetic scenes: the small model is not in {SHIPPED} (--prior names another folder)"
     families = tuple(name for name in FAMILIES if name != "known-edit")
     size = (f"data.width={args.size}", f"data.height={args.size}")
-    title = "Edits of a made world, by the small model, against the truth"
+    title = "Edits of a synthetic scene, by the small model, against the truth"
     overrides = (*given, *size)
     return Bench("demo", title, config, values, families, DEMO, DEMO_TUNING, args.length, overrides)
 
@@ -147,7 +147,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=90, help="a cell begins only if it is likely to end in time")
     parser.add_argument("--quick", action="store_true", help="two rules, one edit, one seed, few steps, nothing tuned")
-    parser.add_argument("--config", default=str(ROOT / "configs" / "dc-ge.yaml"), help="of the edits of made worlds")
+    parser.add_argument("--config", default=str(ROOT / "configs" / "dc-ge.yaml"), help="of edits of synthetic scenes")
     parser.add_argument("--prior", help="a model folder in place of the config's")
     parser.add_argument("--capture", default=str(ROOT.parent / "shared/scenes/fox"), help="a real capture's folder")
     parser.add_argument("--splats", help="PLY of its splats; by default the newest one of outputs/fit")

@@ -6,7 +6,7 @@ All rows of the paper's table on 3DGS but DGE, GaussianEditor with PDS, and what
 named: --config, one or several YAMLs. <folder>/<scene> is a capture, with its splats in splats.ply; where there are
 none, configs/fit.yaml makes them first, as finely as edits at 512 x 512 need and as long as 3DGS does (--fit key=value
 changes that). A list of one's own: --pairs, a YAML like custom/dreamcatalyst/report/paper_pairs.yaml (the default, the
-paper's 40); a scene called demo:... is a made world. Started again, it goes on: pairs that are done are only read.
+paper's 40); a scene called demo:... is a synthetic scene. Started again, it goes on: pairs that are done are only read.
 
 What makes methods comparable is the same for all: splats, views, and the mask, which the list's words find (a config
 without a mask, such as the model-agnostic ones, stays so). Views are those held out, at the config's size; published

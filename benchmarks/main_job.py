@@ -1,4 +1,4 @@
-"""Every edit that the shipped model knows of a made world, through the main job: python benchmarks/main_job.py
+"""Every edit that the shipped model knows of a synthetic scene, through the main job: python benchmarks/main_job.py
 
 For each instruction, at held-out views and against the truth: the unedited scene, `configs/dc-ge.yaml` in both modes,
 and the ceiling: splats fitted (L1, the same steps) to the prior's own edits of the training views, each sampled once.
@@ -76,7 +76,7 @@ def line(instruction: str, row: dict[str, dict[str, float]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--instructions", nargs="+", help="by default the first wording of every edit of that world")
-    parser.add_argument("--source", default="demo:statue", help="a made world")
+    parser.add_argument("--source", default="demo:statue", help="a synthetic scene")
     parser.add_argument("--table", type=Path, default=Path("outputs/main_job.json"), help="results, kept and added to")
     parser.add_argument("--picture", type=Path, help="write source, result and truth of every instruction")
     parser.add_argument("--growing", action="store_true", help="only the edits that add something")

@@ -1,4 +1,4 @@
-"""What a prior's own sampling reaches on made worlds that it never saw, against the truth.
+"""What a prior's own sampling reaches on synthetic scenes that it never saw, against the truth.
 
 python benchmarks/prior.py --picture docs/prior.png     (a folder: --model outputs/prior/.../save/prior)
 

@@ -1,4 +1,4 @@
-"""Every config of the manifest runs one step: as it is, but for a small model, a made world and small pictures."""
+"""Every config of the manifest runs one step: as it is, but for a small model, a synthetic scene and small pictures."""
 
 from __future__ import annotations
 

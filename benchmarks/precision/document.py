@@ -35,9 +35,9 @@ tables and plots here, between two marks.
 
 ## How it is measured
 
-A run is one call of the launcher on `configs/dc-ge.yaml` (edits of a made world, by the small model that comes along)
+A run is one call of the launcher on `configs/dc-ge.yaml` (edits of a synthetic scene, by the small model shipped)
 or `configs/closed-form.yaml` (a real capture, on a prior that is exact). All rules share scene, mask, anchors,
-densification and length, and begin their search at the same rates (of the colours on made worlds: from 0.15 down to
+densification and length, and begin their search at the same rates (of colours on synthetic scenes: from 0.15 down to
 0.01); decreasing noise goes from 0.98 to 0.35 of T there. FreeU is DreamCatalyst's and CSD-like's. "fast" and the
 others are the config's modes, "long" is three times as long as high quality.
 

@@ -1,4 +1,4 @@
-"""Edits of made worlds: what they name, what they change, and what they leave alone to the bit."""
+"""Edits of synthetic scenes: what they name, what they change, and what they leave alone to the bit."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def device(monkeypatch):
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory):
-    """Some of the made world's splats, as a PLY."""
+    """Some of the synthetic scene's splats, as a PLY."""
     return write_ply(tmp_path_factory.mktemp("splats") / "few.ply", make_world("statue").scene[::40])
 
 

@@ -1,4 +1,4 @@
-"""The exact prior around the truth of a made world."""
+"""The exact prior around the truth of a synthetic scene."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ ANCHORED = ["system.anchor.kind=last-densify"]
 
 @pytest.fixture(scope="module")
 def statue():
-    """The made world's splats, as float32 in the order of a PLY of them."""
+    """The synthetic scene's splats, as float32 in the order of a PLY of them."""
     return make_world("statue").scene
 
 

@@ -24,7 +24,7 @@ PLAIN = ["system.guidance.noise=independent", "system.report.every=0", "system.r
 
 @pytest.fixture(scope="module")
 def statue(tmp_path_factory):
-    """A tenth of the made world's splats, twice as large, and their PLY."""
+    """A tenth of the synthetic scene's splats, twice as large, and their PLY."""
     scene = make_world("statue").scene[::10]
     path = write_ply(tmp_path_factory.mktemp("statue") / "few.ply", replace(scene, log_scales=scene.log_scales + 0.7))
     return read_ply(path), f"system.gs_source={path}"

@@ -1,4 +1,4 @@
-"""Things that an edit puts on a made world's bear: a party hat, rabbit ears, a scarf. The world's own splats stay."""
+"""Things that an edit puts on a synthetic bear: a party hat, rabbit ears, a scarf. The world's own splats stay."""
 
 from __future__ import annotations
 

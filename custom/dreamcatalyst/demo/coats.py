@@ -1,4 +1,4 @@
-"""Edits of one thing in a made world: coats and shapes of other bears, metals, paints. All else keeps its bits."""
+"""Edits of one thing in a synthetic scene: coats and shapes of other bears, metals, paints. All else keeps its bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The edits of made worlds, by name and by instruction, each with the truth in 3D."""
+"""The edits of synthetic scenes, by name and by instruction, each with the truth in 3D."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a made world's things stand: grounds of several kinds, skies, walls, rooms and trees."""
+"""Where a synthetic scene's things stand: grounds of several kinds, skies, walls, rooms and trees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Edits of a whole made world: other light, other seasons. Colour per splat, the same from every side."""
+"""Edits of a whole synthetic scene: other light, other seasons. Colour per splat, the same from every side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an edit of a made world becomes: the world's splats after it, and which of them it is about."""
+"""What an edit of a synthetic scene becomes: the world's splats after it, and which of them it is about."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The closed form around a truth in 3D: what a capture becomes by an edit, as each view would show it.
 
 An image operator cannot make what was not there. This prior is asked about views of a capture whose edits are known in
-3D (a made world), and x_0 given image and instruction lies around the render of the *edited* scene from the same
+3D (a synthetic scene), and x_0 given image and instruction lies around the render of the *edited* scene from the same
 camera: all views agree, and an edit may add. It is the oracle for edits that grow; of photographs there is no such
 truth, and the closed form or a network serves.
 """
@@ -54,8 +54,8 @@ class WorldTruth(ClosedForm):
     def condition_of(self, images: Float[Tensor, "B 3 H W"], view: int) -> SourceImage:
         if self.truth.image is None:
             raise PriorError(
-                "world-truth: there is no edited scene to look at. This prior is for made worlds whose edit is known: "
-                "data.source=demo:statue; photographs need another one, such as prior_type=closed-form"
+                "world-truth: there is no edited scene to look at. This prior is for synthetic scenes whose edit is "
+                "known: data.source=demo:statue; photographs need another one, such as prior_type=closed-form"
             )
         condition = SourceImage(self.encode(images))
         shown = self.truth.image(view).to(images).permute(2, 0, 1)[None]

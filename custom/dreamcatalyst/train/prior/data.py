@@ -64,7 +64,7 @@ class Steps(IterableDataset):
 
 @plugin.register("dreamcatalyst-prior-data")
 class PriorData(plugin.pl.LightningDataModule):
-    """Pairs (source, instruction, edited) of made worlds, in a folder of shards."""
+    """Pairs (source, instruction, edited) of synthetic scenes, in a folder of shards."""
 
     @dataclass(frozen=True)
     class Config:
