@@ -253,7 +253,7 @@ def arguments(config: str, overrides: Sequence[str], **base: str) -> list[str]:
 
 
 def case(group: str, name: str, given: Given, *says: str, config: str = "closed-form", **options: object) -> Case:
-    """A tiny run of a config, by default of the edit of a synthetic scene, with `given` added: what is given is refused,
+    """A tiny run of a config, by default of an edit of a synthetic scene, with `given` added: what is given is refused,
     by a line that says `says`. given: arguments, or what makes files and returns arguments."""
     check: Check | None = options.pop("check", None)
 
