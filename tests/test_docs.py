@@ -23,7 +23,7 @@ FRONT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"
 PAGES = FRONT + sorted((ROOT / "docs").glob("*.md"))
 HOSTS = {"configs/dreamfusion-sd.yaml", "configs/instructnerf2nerf.yaml"}  # threestudio's own
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-SHORT = 8  # steps of a run
+SHORT = 4  # steps of a run
 
 
 def text(path: str | Path) -> str:
