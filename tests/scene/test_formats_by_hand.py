@@ -18,6 +18,7 @@ from dreamcatalyst.scene.formats import webp
 from dreamcatalyst.scene.formats.api import read_splats, write_splats
 from dreamcatalyst.scene.formats.palette import codebook, palette
 from dreamcatalyst.scene.formats.quantized import morton_order, turned
+from scipy.spatial.transform import Rotation
 
 from .splatfiles import apart, splats
 
@@ -215,6 +216,28 @@ def test_gltf_by_hand(tmp_path):
     two["nodes"] += [{"children": [0], "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 5, 1]}]
     two["scenes"] = [{"nodes": [0, 1]}]
     assert read_gltf(tmp_path, two).means[:, 2].tolist() == [3.0, 6.0, 8.0, 11.0]
+
+
+def test_a_node_of_a_gltf_turns_splats_with_their_colours(tmp_path):
+    path = write_splats(tmp_path / "a", splats(40, 3), "gltf", options={"separate": True}).path
+    tree = json.loads(path.read_text())
+    q = np.array([0.1, -0.3, 0.4, 0.8])
+    tree["nodes"][0]["rotation"] = (q / np.linalg.norm(q)).tolist()
+    node = torch.from_numpy(Rotation.from_quat(q).as_matrix()).float()
+    flip = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    before, after = read_splats(path), read_gltf(tmp_path, tree)
+    turn = torch.eye(4)
+    turn[:3, :3] = flip @ node @ flip  # of the PLY's axes
+    K = torch.tensor([[[30.0, 0, 16], [0, 30.0, 16], [0, 0, 1]]])
+    viewmat = look_at(
+        torch.tensor([[5.0, -3.0, -9.0]]), torch.tensor([[5.0, -3.0, 1.0]]), torch.tensor([0.0, -1.0, 0.0])
+    )
+    views = [Cameras(viewmat.float() @ m, K, 32, 32) for m in (torch.eye(4), turn.T)]
+    images = [rasterize(s, v, backend="reference").rgb for s, v in zip((before, after), views, strict=True)]
+    assert torch.allclose(images[0], images[1], atol=1e-4) and float(images[0].max()) > 0.1
+    tree["nodes"][0] = {"mesh": 0, "matrix": [0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
+    with pytest.raises(SceneError, match="mirrors"):
+        read_gltf(tmp_path, tree)
 
 
 def test_gltf_with_packed_splats(tmp_path):

@@ -21,6 +21,7 @@ from ...data.origin import ZERO, Origin
 from ...errors import SceneError
 from ...files import replacing, write_text
 from ..gaussians import Gaussians
+from ..place import Similarity, moved, with_degree
 from . import spz
 from .api import Found, SplatFormat, require_room, with_suffix
 from .gltffile import MAGIC, GltfFile, glb
@@ -58,10 +59,8 @@ def read(path: Path, origin: Origin) -> Found:
             parts.append(_placed(path, _splats(file, primitive, extension, notices), matrix, origin))
     if not parts:
         raise SceneError(f"{path}: is a glTF without splats: no mesh in its scene has {KHR}. A mesh: system.mesh=")
-    degrees = {part.sh_degree for part in parts}
-    if len(degrees) > 1:
-        parts = [_widened(part, max(degrees)) for part in parts]
-    return Found(Gaussians.cat(parts) if len(parts) > 1 else parts[0], notices)
+    degree = max(part.sh_degree for part in parts)
+    return Found(Gaussians.cat([with_degree(part, degree) for part in parts]) if parts[1:] else parts[0], notices)
 
 
 def comments(path: Path) -> list[str]:
@@ -125,19 +124,17 @@ def _placed(path: Path, scene: Gaussians, matrix: np.ndarray, origin: Origin) ->
     if not np.allclose(size, size[0], rtol=1e-4) or not size[0] > 0:
         raise SceneError(f"{path}: a node stretches its splats by {size.tolist()}, expected one scale for all axes")
     means = scene.means.double().numpy() @ turn[:3, :3].T + turn[:3, 3] - origin
-    signs = np.rint(np.diagonal(turn) / np.append(size, 1))[:3]
-    if not np.allclose(turn[:3, :3] / size, np.diag(signs), atol=1e-6):
-        raise SceneError(f"{path}: a node turns its splats about an axis of its own; apply that turn before exporting")
-    scene = turned(scene, (int(signs[0]), int(signs[1]), int(signs[2])))
+    rotation = turn[:3, :3] / size
+    right, down, forward = (int(sign) for sign in np.rint(np.diagonal(rotation)))
+    if np.allclose(rotation, np.diag([right, down, forward]), atol=1e-6):
+        scene = turned(scene, (right, down, forward))
+    elif np.linalg.det(rotation) > 0:
+        scene = moved(scene, Similarity(torch.from_numpy(rotation), 1.0, torch.zeros(3, dtype=torch.float64)))
+    else:
+        raise SceneError(f"{path}: a node mirrors its splats, which glTF leaves undefined; apply it before exporting")
     if size[0] != 1:
         scene = replace(scene, log_scales=scene.log_scales + float(np.log(size[0])))
     return replace(scene, means=torch.from_numpy(means.astype(np.float32)))
-
-
-def _widened(scene: Gaussians, degree: int) -> Gaussians:
-    shN = scene.shN.new_zeros(len(scene), REST[degree], 3)
-    shN[:, : scene.shN.shape[1]] = scene.shN
-    return replace(scene, shN=shN)
 
 
 # --- writing
