@@ -9,7 +9,8 @@ from torch import Tensor
 
 ROUNDS = 6  # of Lloyd's iteration on each level
 BLOCK = 8192  # vectors whose distances are held at once
-LOOK = 4  # coarse cells in which a vector's nearest entry is looked for
+LEAF, DEPTH = 256, 6  # entries of a leaf, and divisions one after another, at most
+LOOK = 4  # leaves in which a vector's nearest entry is looked for
 
 
 def palette(
@@ -17,35 +18,38 @@ def palette(
 ) -> tuple[Float[Tensor, "P D"], Int64[Tensor, " N"]]:
     """At most `size` vectors, and which of them stands for each of `vectors`, with little squared error.
 
-    k-means in two levels: about sqrt(size) coarse cells, each then divided by itself into a share of the entries that
-    goes with its vectors' number; at last each vector takes the nearest entry of the LOOK cells nearest to it, and the
-    entries move to the middle of theirs. The cost grows with N sqrt(size), not with N size.
+    k-means as a tree: about sqrt(size) cells, each with a share of the entries that goes with its vectors' number, and
+    divided again until a share is LEAF at most. At last each vector takes the nearest entry of the LOOK leaves nearest
+    to it, and the entries move to the middle of theirs. The cost grows with N sqrt(size), not with N size.
     """
     n = len(vectors)
     if n <= size:
         return vectors.clone(), torch.arange(n)
-    generator = torch.Generator().manual_seed(seed)
-    cells = max(1, round(size**0.5))
-    sample = vectors[torch.randperm(n, generator=generator)[: 64 * cells]]
-    middles = _lloyd(sample, sample[:cells].clone(), ROUNDS)
-    cell = nearest(vectors, middles)
+    leaves = _leaves(vectors, size, torch.Generator().manual_seed(seed), DEPTH)
+    entries, middles = torch.cat(leaves), torch.stack([leaf.mean(dim=0) for leaf in leaves])
+    ends = torch.tensor([0, *np.cumsum([len(leaf) for leaf in leaves])])
+    labels = _nearest_of_leaves(vectors, middles, entries, ends)
+    return _moved(vectors, labels, entries), labels
+
+
+def _leaves(vectors: Tensor, size: int, generator: torch.Generator, depth: int) -> list[Tensor]:
+    """`size` entries for the vectors, those that lie together in one tensor. depth: how often they may be divided; what
+    many equal vectors are is found no finer."""
+    if len(vectors) <= size:
+        return [vectors]
+    order = torch.randperm(len(vectors), generator=generator)
+    if size <= LEAF or depth == 0:
+        return [_lloyd(vectors, vectors[order[: min(size, LEAF)]], ROUNDS)]
+    cells = min(LEAF, round(size**0.5))
+    sample = vectors[order[: 64 * cells]]
+    cell = nearest(vectors, _lloyd(sample, sample[:cells], ROUNDS))
     counts = torch.bincount(cell, minlength=cells)
-    shares = torch.clamp((counts * (size / n)).floor().long(), 1)  # at least one each, at most `size` together
+    shares = torch.where(counts > 0, (counts * (size / len(vectors))).long().clamp_min(1), 0)
     while int(shares.sum()) > size:
         shares[shares.argmax()] -= 1
     rows = torch.argsort(cell, stable=True).split(counts.tolist())
-    parts = []
-    for members, share in zip(rows, shares.tolist(), strict=True):
-        inside = vectors[members]
-        if len(inside) <= share:
-            parts.append(inside)
-            continue
-        first = inside[torch.randperm(len(inside), generator=generator)[:share]]
-        parts.append(_lloyd(inside, first.clone(), ROUNDS))
-    entries = torch.cat(parts)
-    ends = torch.tensor([0, *np.cumsum([len(part) for part in parts])])
-    labels = _nearest_of_cells(vectors, middles, entries, ends)
-    return _moved(vectors, labels, entries), labels
+    parts = zip(rows, shares.tolist(), strict=True)
+    return [leaf for some, share in parts if share for leaf in _leaves(vectors[some], share, generator, depth - 1)]
 
 
 def nearest(vectors: Float[Tensor, "N D"], entries: Float[Tensor, "P D"]) -> Int64[Tensor, " N"]:
@@ -67,8 +71,8 @@ def _moved(vectors: Tensor, labels: Tensor, entries: Tensor) -> Tensor:
     return torch.where(counts[:, None] > 0, sums / counts.clamp_min(1)[:, None], entries)
 
 
-def _nearest_of_cells(vectors: Tensor, middles: Tensor, entries: Tensor, ends: Tensor) -> Tensor:
-    """The nearest entry of the LOOK nearest cells; those of cell c are entries[ends[c]:ends[c + 1]]."""
+def _nearest_of_leaves(vectors: Tensor, middles: Tensor, entries: Tensor, ends: Tensor) -> Tensor:
+    """The nearest entry of the LOOK nearest leaves; those of leaf c are entries[ends[c]:ends[c + 1]]."""
     look = min(LOOK, len(middles))
     half = middles.square().sum(dim=1) / 2
     near = torch.cat(
