@@ -30,12 +30,13 @@ BLOCK = 64  # pairs that are compared between two looks at the time
 @dataclass(frozen=True)
 class Effort:
     """How hard is tried. name: of the database. affine: features whose shape is adapted and averaged over scales
-    (DSP-SIFT). guided: matches are looked for again along the epipolar lines. inliers: matches that a pair needs;
-    start: of the first pair; angle: degrees between its views at least; seen: matches with the model that a further
-    photograph needs."""
+    (DSP-SIFT). peak: contrast that a feature needs. guided: matches are looked for again along the epipolar lines.
+    inliers: matches that a pair needs; start: of the first pair; angle: degrees between its views at least; seen:
+    matches with the model that a further photograph needs."""
 
     name: str
     affine: bool
+    peak: float
     guided: bool
     inliers: int
     start: int
@@ -43,8 +44,8 @@ class Effort:
     seen: int
 
 
-PLAIN = Effort("plain", False, False, inliers=15, start=100, angle=16.0, seen=30)  # COLMAP's own numbers
-THOROUGH = Effort("thorough", True, True, inliers=10, start=30, angle=4.0, seen=12)
+PLAIN = Effort("plain", False, 0.02 / 3, False, inliers=15, start=100, angle=16.0, seen=30)  # COLMAP's own numbers
+THOROUGH = Effort("thorough", True, 0.002, True, inliers=10, start=30, angle=4.0, seen=12)
 
 
 @contextmanager
@@ -137,7 +138,7 @@ def extract(database: Path, images: Path, names: Sequence[str], effort: Effort, 
     with library() as pycolmap:
         extraction = pycolmap.FeatureExtractionOptions()
         extraction.max_image_size, extraction.num_threads = options.side, torch.get_num_threads()
-        extraction.sift.max_num_features = options.features
+        extraction.sift.max_num_features, extraction.sift.peak_threshold = options.features, effort.peak
         extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = effort.affine
 
         def work(block: Sequence[str], token: Any) -> None:

@@ -17,7 +17,7 @@ class SfmOptions:
     """How the cameras of photographs or of a video are found (data.sfm)."""
 
     photographs: Annotated[int, Range("[3, 10000]")] = 200  # used at most, or frames; more are thinned evenly
-    step: Annotated[float, Range("[0.002, 0.5]")] = 0.03  # of a video's diagonal: how far the view moves between frames
+    step: Annotated[float, Range("[0.002, 0.5]")] = 0.02  # of a video's diagonal: how far the view moves between frames
     side: Annotated[Side, Range("[128, 32766]")] = 1600  # pixels; features are sought in copies no longer than that
     features: Annotated[int, Range("[256, 65536]")] = 8192  # SIFT features per photograph at most
     # Which photographs are compared: all with all; neighbours in time, and where a walk comes back; those that look

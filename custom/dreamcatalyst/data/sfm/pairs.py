@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -22,12 +22,14 @@ def exhaustive(n: int) -> list[Pair]:
     return list(combinations(range(n), 2))
 
 
-def sequential(n: int, near: int = NEXT) -> list[Pair]:
-    """Each with the next `near`, and with those 2, 4, 8 ... times as far."""
-    steps = [*range(1, near + 1)]
-    while steps[-1] * 2 < n:
-        steps.append(steps[-1] * 2)
+def neighbours(n: int, steps: Sequence[int]) -> list[Pair]:
+    """Each with those so many places on."""
     return [(i, i + step) for i in range(n) for step in steps if i + step < n]
+
+
+def sequential(n: int) -> list[Pair]:
+    """Each with the next NEXT, and with those 2, 4, 8 ... times as far."""
+    return neighbours(n, [*range(1, NEXT + 1), *(NEXT << i for i in range(1, n.bit_length()))])
 
 
 def alike(likeness: np.ndarray, most: int, apart: int = 0) -> list[Pair]:
@@ -50,4 +52,4 @@ def choose_pairs(n: int, video: bool, options: SfmOptions, likeness: Callable[[]
         return exhaustive(n)
     if kind == "sequential":  # where a walk comes back to what it has seen, that looks alike
         return sorted({*sequential(n), *alike(likeness(), LOOPS, apart=2 * NEXT)})
-    return sorted({*alike(likeness(), ALIKE), *sequential(n, BESIDE)})
+    return sorted({*alike(likeness(), ALIKE), *neighbours(n, range(1, BESIDE + 1))})

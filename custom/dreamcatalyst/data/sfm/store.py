@@ -61,9 +61,9 @@ def cameras(
 
 
 def _make(folder: Path, source: Path, video: bool, options: SfmOptions, prepare: Prepare) -> None:
+    plugin.info(f"cameras of {source} are found now, and kept in {folder}. Ctrl-C loses nothing of it")
     began = time.monotonic()
     folder.mkdir(exist_ok=True)
-    plugin.info(f"cameras of {source} are found now, and kept in {folder}. Ctrl-C loses nothing of it")
     pictures, said = _prepared(folder, prepare)
     search = Search(source, folder, pictures, video, options, {"photographs": round(time.monotonic() - began, 1)})
     found = search.run()
