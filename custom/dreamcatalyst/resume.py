@@ -96,8 +96,9 @@ def contents(told: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _folder_digest(folder: Path, capture: bool) -> str:
-    """Of names, sizes and, up to a size, contents: of a capture, of its cameras; else of all files."""
-    inside = {path for pattern in (CAMERAS if capture else ("**/*",)) for path in folder.glob(pattern)}
+    """Of names, sizes and, up to a size, contents: of a capture's cameras, where it has some; else of all files."""
+    inside = {path for pattern in CAMERAS for path in folder.glob(pattern)} if capture else set()
+    inside = inside or set(folder.glob("**/*"))
     digest = hashlib.blake2b(digest_size=files.DIGEST)
     for path in sorted(path for path in inside if path.is_file()):
         size = path.stat().st_size

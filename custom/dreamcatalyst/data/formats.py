@@ -82,7 +82,7 @@ class Scan:
     """What a format reads from its files. notices: sentences for the user about what was left aside.
 
     scene: splats whose renders are the photographs, where there are no files of any; truths: what edits of the capture
-    become, where that is known.
+    become, where that is known. found: the folder with report.json and cameras.png of cameras that were found here.
     """
 
     shots: list[Shot]
@@ -90,6 +90,7 @@ class Scan:
     notices: list[str] = field(default_factory=list)
     scene: SplatScene | None = None
     truths: GroundTruths | None = None
+    found: Path | None = None
 
 
 @dataclass(frozen=True)

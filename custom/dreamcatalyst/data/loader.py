@@ -42,8 +42,8 @@ def open_capture(source: str | Path, options: CaptureOptions = DEFAULTS) -> Capt
     shots, points, origin = _recentred(shots, scan.points)
     views = [_view(shot, options) for shot in shots]
     train, test = split(len(views), options, path)
-    notices = (*scan.notices, *masks)
-    capture = Capture(path, views, train, test, points, notices, options, origin, scan.scene, scan.truths)
+    notices, found = (*scan.notices, *masks), scan.found
+    capture = Capture(path, views, train, test, points, notices, options, origin, scan.scene, scan.truths, found)
     if not options.dataparser:
         return capture
     back = torch.eye(4, dtype=torch.float64)

@@ -42,7 +42,7 @@ def read(source: Path, options: CaptureOptions) -> Scan:
 def scan(folder: Path, options: CaptureOptions, said: Sequence[str]) -> Scan:
     """What stands in a folder of sfm/store.py. said: notices that go before its own."""
     found = colmap.read(folder, replace(options, images="images"))
-    return replace(found, notices=[*said, *store.notices(folder)])
+    return replace(found, notices=[*said, *store.notices(folder)], found=folder)
 
 
 FORMAT = Format("a folder of photographs", find, read)

@@ -35,7 +35,8 @@ class Capture:
 
     points: those of the reconstruction, if any. notices: sentences for the user about what was left aside. origin: the
     point of the files' world that is (0,0,0) here (data/origin.py). scene: splats whose renders are the photographs,
-    where there are no files of any. truths: what edits become, where that is known.
+    where there are no files of any. truths: what edits become, where that is known. found: the folder with report.json
+    and cameras.png of how cameras were found, where they were (data/sfm).
     """
 
     source: Path
@@ -48,6 +49,7 @@ class Capture:
     origin: Origin = ZERO
     scene: SplatScene | None = None
     truths: GroundTruths | None = None
+    found: Path | None = None
 
     def __len__(self) -> int:
         return len(self.views)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from ..files import write_text
+from ..files import write_bytes, write_text
 from .chart import line_chart, picture_file
 from .curve import Curve
 from .machine import machine, versions
@@ -59,7 +59,8 @@ def fit_before(run: RunFacts) -> dict:
 
 
 def write_report(run: RunFacts, record: Record, scores: Mapping[int, Mapping[str, float]]) -> list[Path]:
-    """Write error.csv and error.svg (where there was training), index.html and summary.json; return their folder.
+    """Write error.csv and error.svg (where there was training), index.html and summary.json, and copy how cameras were
+    found (where they were: cameras.json, cameras.png); return their folder.
 
     The summary's "overhead" says what reports took: rows, this function, and the share of both in the whole.
     """
@@ -70,6 +71,9 @@ def write_report(run: RunFacts, record: Record, scores: Mapping[int, Mapping[str
         errors = [f"{measure.name}_" for measure in METRICS.parts()]
         plots = [chart for start, chart in charts(record.curve).items() if start in errors]
         write_text(folder / "error.svg", picture_file(plots))
+    if run.capture.found is not None:
+        for name, copy in (("report.json", "cameras.json"), ("cameras.png", "cameras.png")):
+            write_bytes(folder / copy, (run.capture.found / name).read_bytes())
     summary = {
         "step": run.step,
         "seconds": round(seconds, 2),
@@ -156,6 +160,7 @@ def make_page(run: RunFacts, record: Record, summary: Mapping, scores: Mapping[i
     given = {
         name: "\n".join(f"{key}: {value}" for key, value in summary[name].items()) for name in ("machine", "versions")
     }
+    found = {"Cameras": "\n".join(run.capture.notices)} if run.capture.found is not None else {}
     texts = {"The plan": run.plan} if run.plan and (run.report / "plan.json").is_file() else {}
     return Page(
         title=run.title,
@@ -166,5 +171,5 @@ def make_page(run: RunFacts, record: Record, summary: Mapping, scores: Mapping[i
         stages=summary["stages"],
         tables={"Scores": score_rows([views[i].name for i in scores], list(scores.values()))} if scores else {},
         notice=unmeasured([*mean, *record.curve.columns]),
-        texts={**texts, "Config": run.config_text, "Machine": given["machine"], "Versions": given["versions"]},
+        texts={**found, **texts, "Config": run.config_text, "Machine": given["machine"], "Versions": given["versions"]},
     )
