@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from ... import plugin
 from ...errors import DataError
 from ...meter import Meter
 from .options import SfmOptions
@@ -77,23 +78,23 @@ def watched(work: Callable[[Any], T], look: Callable[[], None] = lambda: None) -
     take each other's locks away.
     """
     with library() as pycolmap:
-        token, outcome = pycolmap.CancellationToken(), []
+        token, outcome, ended = pycolmap.CancellationToken(), [], threading.Event()
 
         def run() -> None:
             try:
                 outcome.append((work(token), None))
             except BaseException as error:
                 outcome.append((None, error))
+            ended.set()
 
-        thread = threading.Thread(target=run, daemon=True)
-        thread.start()
+        threading.Thread(target=run, daemon=True).start()
         try:
-            while thread.is_alive():
-                thread.join(DRAW)
+            while not ended.wait(DRAW):  # not Thread.join, which a signal has believe that the thread has ended
                 look()
         except BaseException:
             token.cancel()
-            thread.join()
+            plugin.info("cameras: stopping as soon as what is written is whole")
+            ended.wait()
             raise
         result, error = outcome[0]
         if error is not None:

@@ -50,7 +50,8 @@ def cameras(
     prepare: makes the working copies in the folder that it gets, once, and gives them and what is to be said of them.
     Raises DataError: no cameras can be found, with the reason; ConfigError: the folder cannot be written.
     """
-    asked = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name != "registered"}
+    without = ("registered",) if video else ("registered", "step")  # which change nothing of what is found
+    asked = {f.name: getattr(options, f.name) for f in dataclasses.fields(options) if f.name not in without}
     folder = kept.home() / "captures" / kept.digest(VERSION, video, list(contents), asked)
     if not (folder / REPORT).is_file():
         told = f"cameras: another process finds those of {source}: waiting for it"
@@ -71,18 +72,18 @@ def _make(folder: Path, source: Path, video: bool, options: SfmOptions, prepare:
     facts = _write(folder, found)
     placed = {found.model.images[i].name for i in found.model.reg_image_ids()}
     aside = [each.original for each in pictures if each.name not in placed]
-    n = len(pictures)
-    said = [*said, f"{source}: {len(placed)} of {n} photographs have a camera, found {found.how}; kept in {folder}"]
+    n, what = len(pictures), "frames" if video else "photographs"
+    said = [*said, f"{source}: {len(placed)} of {n} {what} have a camera, found {found.how}; kept in {folder}"]
     if aside:
         said.append(f"{source}: no camera for {check.names_of(aside)}, which are left out: they overlap too little")
     if found.others:
         said.append(
-            f"{source}: the photographs fall into parts that nothing connects; the largest is used, of {len(placed)} "
+            f"{source}: the {what} fall into parts that nothing connects; the largest is used, of {len(placed)} "
             f"(others: {', '.join(map(str, found.others))}). Take some that show both parts at once"
         )
     facts |= {"source": str(source), "photographs": n, "not_registered": aside}
     facts |= {"seconds": search.seconds, "notices": said}
-    title = f"{len(placed)} of {n} photographs, {facts['points']:,} points, {facts['reprojection_error']:.2f} px"
+    title = f"{len(placed)} of {n} {what}, {facts['points']:,} points, {facts['reprojection_error']:.2f} px"
     _picture(folder, found.model, title)
     shutil.rmtree(folder / "models", ignore_errors=True)
     write_text(folder / REPORT, json.dumps(facts, indent=1, ensure_ascii=False))
