@@ -6,9 +6,10 @@ python benchmarks/cameras.py --capture <folder> --fit                   # and co
 python benchmarks/cameras.py --world demo:statue                        # a video of an orbit around a made world
 
 Errors are those after the best similarity (Umeyama 1991): of centres as a share of the cameras' extent (the largest
-distance of one from their mean), of rotations in degrees. Nothing is taken from the cache and nothing is left there.
-key=value goes to the capture's options (data.sfm.features=4096). The fits differ in their cameras alone: photographs,
-size (data.downscale=4) and held-out views are the same; --steps sets their length.
+distance of one from their mean), of rotations in degrees. Seconds are those of the clock and of the processor. Nothing
+is taken from the cache and nothing is left there, unless --kept names one. key=value goes to the capture's options
+(data.sfm.features=4096). The fits differ in their cameras alone: photographs, size (data.downscale=4) and held-out
+views are the same; --steps sets their length.
 """
 
 from __future__ import annotations
@@ -73,10 +74,9 @@ def compare(capture: Capture, truth: dict[str, Cameras]) -> dict[str, float]:
     return errors(found, Cameras(true, torch.eye(3).repeat(len(views), 1, 1), 1, 1))
 
 
-def found_in(cache: Path) -> dict:
-    """The report of the one capture that is kept there."""
-    (path,) = cache.glob("captures/*/report.json")
-    return json.loads(path.read_text(encoding="utf-8")) | {"folder": str(path.parent)}
+def found_in(capture: Capture) -> dict:
+    """The report of how its cameras were found."""
+    return json.loads((capture.found / "report.json").read_text(encoding="utf-8"))
 
 
 def show(facts: dict, found: dict[str, float]) -> None:
@@ -152,6 +152,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, metavar="N", help="the first so many")
     parser.add_argument("--fit", action="store_true", help="fit splats on both sets of cameras, too")
     parser.add_argument("--steps", type=int, default=3500, help="of each fit")
+    parser.add_argument("--kept", type=Path, metavar="DIR", help="the cache to use, so that a second command goes on")
     parser.add_argument("--write", type=Path, metavar="DIR", help="keep the report and its picture there")
     args, given = parser.parse_known_args()
     if wrong := [word for word in given if not word.startswith("data.")]:
@@ -160,7 +161,8 @@ def main() -> int:
     merged = OmegaConf.from_dotlist([word.removeprefix("data.") for word in given])
     with tempfile.TemporaryDirectory(prefix="cameras-") as name:
         folder = Path(name)
-        os.environ["DREAMCATALYST_CACHE"] = str(folder / "kept")
+        cache = (args.kept or folder / "kept").resolve()
+        os.environ["DREAMCATALYST_CACHE"] = str(cache)
         try:
             options = parse(CaptureOptions, merged, "data")
             if args.world:
@@ -172,7 +174,7 @@ def main() -> int:
         except DreamCatalystError as error:
             print(f"error: {error}", file=sys.stderr)
             return 2
-        facts = found_in(folder / "kept")
+        facts = found_in(capture)
         show(facts, compare(capture, truth))
         if args.fit:
             known = args.capture or args.world
@@ -181,7 +183,7 @@ def main() -> int:
         if args.write:
             args.write.mkdir(parents=True, exist_ok=True)
             for file in ("report.json", "cameras.png"):
-                shutil.copy(Path(facts["folder"]) / file, args.write / file)
+                shutil.copy(capture.found / file, args.write / file)
     return 0
 
 

@@ -17,6 +17,11 @@ from .options import SfmOptions
 CONVERTED = (".heic", ".heif", ".avif")  # read through Pillow, the first two with pillow-heif
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".3gp", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".ogv")
+FEWEST = 3  # photographs that cameras are found from
+MORE = (
+    "Cameras are found from at least 3, better 20 or more, taken from places around the scene, each showing most of "
+    "what the one before shows"
+)
 DEPTH = 3  # folders below the one that is named
 CAPTURE = ("sparse", "transforms.json", "cameras.json")  # what makes a folder a capture of another format
 
@@ -48,7 +53,7 @@ def natural(text: str) -> list[tuple[int, int, str]]:
 def choose(root: Path, options: SfmOptions) -> tuple[list[Path], list[str]]:
     """The photographs below `root` that are used, and what is said of those that are not.
 
-    Raises DataError where there are fewer than two that differ.
+    Raises DataError where there are fewer than three that differ.
     """
     found = photographs_below(root)
     if not found:
@@ -56,12 +61,11 @@ def choose(root: Path, options: SfmOptions) -> tuple[list[Path], list[str]]:
         raw = f" '{names[0]}' is a raw file: develop them to JPEG." if names else ""
         raise DataError(f"{root}: holds no photographs (looked for {', '.join((*SUFFIXES, *CONVERTED))}).{raw}")
     chosen, notices = _each_once(root, found)
-    if len(chosen) < 2:
-        what = "one photograph" if len(found) == 1 else f"{len(found)} files that are all the same photograph"
-        raise DataError(
-            f"{root}: holds {what}. Cameras are found from at least 3, better 20 or more, taken from places around the "
-            "scene, each showing at least half of what the one before shows"
-        )
+    if len(chosen) < FEWEST:
+        what = "one photograph" if len(chosen) == 1 else "two photographs"
+        if len(found) > len(chosen) == 1:
+            what = f"{len(found)} files that are all the same photograph"
+        raise DataError(f"{root}: holds {what}. {MORE}")
     if len(chosen) > options.photographs:
         notices.append(
             f"{root}: {options.photographs} of {len(chosen)} photographs are used, evenly spread. "

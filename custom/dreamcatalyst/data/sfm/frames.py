@@ -14,6 +14,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...files import replacing
+from .choose import FEWEST
 from .options import SfmOptions
 from .prepare import QUALITY, Picture
 
@@ -25,7 +26,6 @@ REFERENCE = 0.02  # of the diagonal: when the view has moved so far, new points 
 SURVIVE = 0.6  # or when fewer of them are left
 WINDOW = 0.4  # of a step: how far from its place the sharpest frame is looked for
 REPEATED = 0.25  # grey levels: frames that differ less are one frame, written twice
-FEWEST = 3
 
 
 @dataclass(frozen=True)

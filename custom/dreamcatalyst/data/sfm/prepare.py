@@ -18,7 +18,7 @@ import numpy as np
 from ...errors import DataError
 from ...files import replacing
 from ..images import decode, image_size
-from .choose import CONVERTED
+from .choose import CONVERTED, FEWEST
 from .options import SfmOptions
 
 MAKE, MODEL, ORIENTATION, EXIF = 0x010F, 0x0110, 0x0112, 0x8769  # tags of EXIF 2.32, and of its own directory
@@ -75,9 +75,9 @@ def prepare(
 
 def _require(root: Path, n: int, pictures: list[Picture], folder: Path, bad: list, panoramas: list) -> None:
     """Raise DataError where what is left is not what cameras are found from."""
-    if 2 * len(bad) > n or (bad and len(pictures) < 2):
+    if bad and (2 * len(bad) > n or len(pictures) < FEWEST):
         raise DataError(f"{root}: {len(bad)} of {n} photographs cannot be read, first: {bad[0][1]}")
-    if panoramas and len(pictures) < 3:
+    if panoramas and len(pictures) < FEWEST:
         raise DataError(
             f"{root}: '{panoramas[0]}' is a panorama ({len(panoramas)} of {n} are), which no single camera took. Take "
             "ordinary photographs while walking around the scene, or cut it into perspective views"

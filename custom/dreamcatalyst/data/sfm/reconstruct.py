@@ -49,7 +49,8 @@ class Found(NamedTuple):
 @dataclass
 class Search:
     """The search for the cameras of photographs, whose copies are in folder/images and whose databases in `folder`:
-    what is done there is not done again. source: for messages. seconds: of each stage of this process."""
+    what is done there is not done again. source: for messages. seconds: of each stage of this process, by the
+    clock and of the processor."""
 
     source: Path
     folder: Path
@@ -128,6 +129,7 @@ class Search:
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        began = time.monotonic()
+        began, used = time.monotonic(), time.process_time()
         yield
-        self.seconds[stage] = round(self.seconds.get(stage, 0) + time.monotonic() - began, 1)
+        for name, spent in ((stage, time.monotonic() - began), (f"{stage}_processor", time.process_time() - used)):
+            self.seconds[name] = round(self.seconds.get(name, 0) + spent, 1)
