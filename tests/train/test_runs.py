@@ -33,7 +33,8 @@ def assert_same_splats(a, b):
 
 
 def test_a_fit_approaches_its_photographs_and_leaves_everything(launch):
-    trial = launch("fit.yaml", "trainer.max_steps=60", "system.densify.start=20", "system.densify.every=20")
+    begins = ["system.initial_opacity=0.1", "system.densify.start=20", "system.densify.every=20"]
+    trial = launch("fit.yaml", "trainer.max_steps=60", *begins)
     curve = rows(trial)
     assert curve[0]["step"] == 0 and curve[-1]["step"] == 60
     assert curve[-1]["psnr_photo"] > curve[0]["psnr_photo"] + 3
