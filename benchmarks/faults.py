@@ -28,6 +28,7 @@ sys.path[:0] = [str(ROOT / "custom"), str(ROOT)]
 os.environ.setdefault("HF_HUB_OFFLINE", "1")  # a model that is not there is not there: no case asks the network
 
 from benchmarks.faulty import (  # noqa: E402
+    additions,
     captures,
     commands,
     deletions,
@@ -45,7 +46,7 @@ from benchmarks.faulty import (  # noqa: E402
 )
 from benchmarks.faulty.cases import Case, Outcome, Place  # noqa: E402
 
-GROUPS = [commands, values, captures, photographs, splats, formats, masks, fits, deletions]
+GROUPS = [commands, values, captures, photographs, splats, formats, masks, fits, deletions, additions]
 GROUPS += [priors, pairs, resumes, folders, processes]
 CASES: list[Case] = [case for group in GROUPS for case in group.CASES]
 SHOWN = 240  # characters of a message in the table

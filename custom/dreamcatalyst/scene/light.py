@@ -16,8 +16,9 @@ from torch import Tensor
 
 from .gaussians import SH_C0, Gaussians
 
-PLACES = 6  # parts of a scene within which surfaces are taken to be of one material each
-RIDGE = 0.02  # what holds the light to be even where normals say little, in variance of normals
+PLACES = 12  # parts of a scene within which surfaces are taken to be of one material each
+RIDGE = 0.01  # what holds the light to be even where normals say little, in variance of normals
+HALF = 0.5  # pixels in which a splat must be seen
 ROUNDS = 3  # of reweighting
 DARKEST = 0.02  # colours below count as this: their logarithm says nothing
 MOST = 20_000  # splats that are looked at
@@ -27,8 +28,9 @@ DOUBT = 0.15  # standard deviation of its logarithm among those worlds
 STRONGEST = 4.0  # factor by which light may change a colour, either way
 
 
-def normals(scene: Gaussians, seen_from: Float[Tensor, "C 3"]) -> Float[Tensor, "N 3"]:
-    """Unit normals of splats, their thinnest axes, each towards the nearest of the places [C,3] that see it."""
+def normals(scene: Gaussians, towards: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Unit normals of splats, their thinnest axes, each on the side of its direction in `towards` [N,3]: there are
+    those who see it."""
     w, x, y, z = torch.nn.functional.normalize(scene.quats.detach(), dim=-1).unbind(-1)
     axes = torch.stack(
         [
@@ -40,9 +42,6 @@ def normals(scene: Gaussians, seen_from: Float[Tensor, "C 3"]) -> Float[Tensor, 
     )  # rows: where each axis points
     thinnest = scene.log_scales.detach().argmin(dim=1)
     found = axes[torch.arange(len(scene), device=thinnest.device), thinnest]
-    means = scene.means.detach()
-    nearest = torch.cat([torch.cdist(part, seen_from.to(part)).argmin(dim=1) for part in means.split(65536)])
-    towards = seen_from.to(means)[nearest] - means
     return torch.where((found * towards).sum(dim=1, keepdim=True) < 0, -found, found)
 
 
@@ -51,8 +50,9 @@ def plain_colors(scene: Gaussians) -> Float[Tensor, "N 3"]:
     return 0.5 + SH_C0 * scene.sh0[:, 0].detach()
 
 
-def lamp(scene: Gaussians, facing: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]:
+def lamp(scene: Gaussians, facing: Float[Tensor, "N 3"], seen: Float[Tensor, " N"]) -> Float[Tensor, "3 3"]:
     """How the logarithm of RGB (columns) grows with the normal's x, y, z (rows), by what is the same in all places.
+    seen [N]: in how many pixels each is; of those that nobody sees the colours are what nothing has judged.
 
     Colours are log albedo + log light(normal). Within a place the albedo is taken to be one, so that differences from
     the place's mean are the light's: weighted least squares, held to zero by RIDGE, and with less weight for what does
@@ -60,14 +60,17 @@ def lamp(scene: Gaussians, facing: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]
     """
     from scipy.cluster.vq import kmeans2
 
-    every = max(1, -(-len(scene) // MOST))
-    scene, facing = scene[::every], facing[::every].double()
+    shown = (seen > HALF).nonzero()[:, 0]
+    shown = shown[:: max(1, -(-len(shown) // MOST))]
+    if len(shown) < 2:
+        return scene.means.new_zeros(3, 3)
+    scene, facing = scene[shown], facing[shown].double()
     logs = plain_colors(scene).double().clamp_min(DARKEST).log()
     places = min(PLACES, len(scene))
     spots = scene.means.detach().cpu().double().numpy()
     _, place = kmeans2(spots, far_apart(spots, places), minit="matrix")
     member = torch.nn.functional.one_hot(torch.from_numpy(place).long(), places).to(facing)
-    weights, solution = scene.opacities.detach().double(), facing.new_zeros(3, 3)
+    weights, solution = torch.ones_like(facing[:, 0]), facing.new_zeros(3, 3)
 
     def apart(values: Tensor) -> Tensor:
         sums = member.T @ (weights[:, None] * values)
@@ -79,7 +82,7 @@ def lamp(scene: Gaussians, facing: Float[Tensor, "N 3"]) -> Float[Tensor, "3 3"]
         matrix = (share * turned).T @ turned + RIDGE * torch.eye(3).to(facing)
         solution = torch.linalg.solve(matrix, (share * turned).T @ varied)
         misses = (varied - turned @ solution).norm(dim=1)
-        weights = scene.opacities.detach().double() / (1 + (misses / (1.48 * misses.median() + 1e-4)) ** 2)
+        weights = 1 / (1 + (misses / (1.48 * misses.median() + 1e-4)) ** 2)
     return solution.to(scene.means)
 
 

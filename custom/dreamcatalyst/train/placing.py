@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from .. import plugin
+from ..data.camera import Cameras, look_at
 from ..data.formats import AXES
 from ..data.orbit import world_up
 from ..data.origin import Origin
@@ -22,19 +23,23 @@ from ..demo.things import first_thing, relit
 from ..demo.worlds import World, make_world
 from ..errors import ConfigError, SceneError, nearest
 from ..render.ground import ground_at, level_under, require_level
+from ..render.lift import lift
 from ..scene import light
 from ..scene.create import flat_splats
 from ..scene.formats.api import named, read_splats, splat_origin
 from ..scene.formats.gltf import KHR
 from ..scene.formats.gltffile import GltfFile
 from ..scene.gaussians import Gaussians
-from ..scene.place import ADDED, Similarity, joined, moved, rotation_from, stance, turn_between
+from ..scene.place import ADDED, Similarity, Stance, joined, moved, rotation_from, stance, turn_between
 from ..scene.plyfile import read_vertices
 from .add_config import AddConfig
 from .drawing import Drawer
 
 LOOKED_AT = 8  # views whose colours say how bright the scene's light is
-VIEWPOINTS = 64  # around a thing, from which its surface is seen: they say which side of a splat is out
+VIEWPOINTS = 24  # views that say which side of a splat is out: of the scene, and around a thing
+SIDE = 96  # pixels of those around a thing
+UNSEEN = 1e-6  # pixels with which a view counts that does not see a splat: where none does, they decide
+FLAT = 1e-3  # of its radius: a thing that is lower has no height to go by
 LARGE = 20.0  # times the scene's extent, or less than a part of it, from which on a thing's size is surely a mistake
 
 
@@ -138,24 +143,24 @@ class Adder:
             turn = turn @ turn_between(signed_axis(self.thing.axis), self.up)
         upright = moved(self.thing.scene, Similarity(turn, 1.0, torch.zeros(3).double()))
         stands = stance(upright, self.up)
-        scale = self.scale(stands.height)
+        scale = self.scale(stands)
         if not config.stands:
             return Similarity(turn, scale, torch.zeros(3).double())
         foot = self.foot(scene, scale * stands.radius, scale * stands.height)
         return Similarity(turn, scale, foot.cpu() - scale * stands.foot.cpu())
 
-    def scale(self, height: float) -> float:
-        """How many times as large the thing becomes. height: that it has when it stands."""
+    def scale(self, stands: Stance) -> float:
+        """How many times as large the thing becomes. stands: how it does, as large as it is."""
         config = self.config
         wanted = config.height if config.size is None else config.size * self.capture.extent
         if wanted is None:
             return 1.0 if config.scale is None else config.scale
-        if not height > 0:
+        if not stands.height > FLAT * stands.radius:
             key = "height" if config.size is None else "size"
             raise ConfigError(
                 f"system.add.{key}: the thing has no height when it stands. Give system.add.scale instead"
             )
-        return wanted / height
+        return wanted / stands.height
 
     def foot(self, scene: Gaussians, radius: float, height: float) -> Tensor:
         """The point [3] that a thing of this size stands on."""
@@ -197,8 +202,8 @@ class Adder:
             ones = ones * light.brightness(self.pictures(scene)).to(ones)
         if config.light != "shading" or not self.thing.surface:
             return ones
-        facing = light.normals(there, self.viewpoints(there))
-        change = self.lamp(scene, there) - (light.lamp(there, facing) if self.thing.lit else 0.0)
+        facing, seen = faced(there, around(there))
+        change = self.lamp(scene, there) - (light.lamp(there, facing, seen) if self.thing.lit else 0.0)
         return ones * (facing @ change.to(facing)).exp()
 
     def lamp(self, scene: Gaussians, there: Gaussians) -> Tensor:
@@ -206,14 +211,10 @@ class Adder:
         near = (scene.means - there.means.mean(dim=0)).norm(dim=1) <= self.capture.extent
         if not bool(near.any()):
             return scene.means.new_zeros(3, 3)
-        around, cameras = scene[near], self.capture.training_cameras
-        return light.lamp(around, light.normals(around, cameras.centers))
-
-    def viewpoints(self, there: Gaussians) -> Tensor:
-        """Places [C,3] all around a thing."""
-        middle = there.means.mean(dim=0)
-        reach = 2 * (there.means - middle).norm(dim=1).max()
-        return middle + reach * sphere_points(VIEWPOINTS).to(middle)
+        train = self.capture.train
+        cameras = [self.capture.cameras([i]) for i in train[:: max(1, len(train) // VIEWPOINTS)]]
+        facing, seen = faced(scene, cameras)
+        return light.lamp(scene[near], facing[near], seen[near])
 
     def pictures(self, scene: Gaussians) -> Tensor:
         """Pixels [P,3] of some views, those that show something."""
@@ -224,6 +225,30 @@ class Adder:
             drawn = self.draw(scene, self.capture.cameras([number]))
             found.append(drawn.rgb[0][drawn.alpha[0, ..., 0] > 0.5])
         return torch.cat(found)
+
+
+def faced(scene: Gaussians, cameras: Sequence[Cameras]) -> tuple[Tensor, Tensor]:
+    """The normals [N,3] of splats, on the side from which these views see them, and in how many pixels [N] they do."""
+    towards, seen = torch.zeros_like(scene.means), torch.zeros_like(scene.logit_opacities)
+    for camera in cameras:
+        everywhere = scene.means.new_ones(1, camera.height, camera.width)
+        pixels = lift(scene, camera, everywhere).total
+        seen += pixels
+        directions = torch.nn.functional.normalize(camera.centers.to(scene.means) - scene.means, dim=1)
+        towards += (pixels + UNSEEN)[:, None] * directions
+    return light.normals(scene, towards), seen
+
+
+def around(thing: Gaussians) -> list[Cameras]:
+    """Views of a thing from all sides."""
+    middle = thing.means.mean(dim=0)
+    radius = (thing.means - middle).norm(dim=1).max()
+    eyes = middle + 3 * radius * sphere_points(VIEWPOINTS).to(middle)
+    viewmats = look_at(eyes, middle, middle.new_tensor([0.0, 0.0, 1.0]))
+    focal, half = 2.5 * SIDE / 2, SIDE / 2
+    K = middle.new_tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]]).repeat(VIEWPOINTS, 1, 1)
+    cameras = Cameras(viewmats, K, SIDE, SIDE)
+    return [cameras[k] for k in range(VIEWPOINTS)]
 
 
 def signed_axis(name: str) -> Tensor:
