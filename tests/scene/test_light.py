@@ -36,7 +36,7 @@ def test_normals_face_those_who_see_them():
 def test_a_lamp_is_found_whatever_is_painted():
     scene, facing = spheres(4, GROWTH)
     torch.testing.assert_close(
-        lamp(scene, facing, torch.ones(len(scene))), GROWTH, atol=0.03, rtol=0
+        lamp(scene, facing, torch.ones(len(scene))), GROWTH, atol=0.045, rtol=0
     )  # the ridge takes a twentieth
     even, facing = spheres(4, torch.zeros(3, 3))
     assert lamp(even, facing, torch.ones(len(even))).abs().max() < 1e-3
