@@ -176,8 +176,10 @@ class FitMethod(Method):
 
     @property
     def fitted(self) -> Fitted | None:
+        if self.cfg.gs_source and self.context.step() == 0:  # nothing was fitted here yet
+            return Fitted.of(self.cfg.gs_source)
         if not self.capture.has_photos:
-            return Fitted.of(self.cfg.gs_source) if self.cfg.gs_source else None
+            return None
         return Fitted.at([self.capture.views[i] for i in self.capture.train])
 
     def references(self, index: int) -> dict[str, Tensor]:
