@@ -1,4 +1,4 @@
-"""Things of other seeds' worlds put into made worlds, against the truth of them lit by these worlds' light.
+"""Things of other seeds' worlds put into synthetic scenes, against the truth of them lit by these worlds' light.
 
 For each pair and each hour of the day: the thing is stood on the ground under a pixel of one view and its light
 matched (system.add.light: off, gain, shading; and the mean colour of the surroundings, "grey world", for comparison).

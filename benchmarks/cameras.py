@@ -3,7 +3,7 @@
 python benchmarks/cameras.py --capture <COLMAP folder>                  # its photographs, against its own sparse/0
 python benchmarks/cameras.py --capture <folder> --photographs 11        # of them 11, evenly spread; or --first 11
 python benchmarks/cameras.py --capture <folder> --fit                   # and configs/fit.yaml on both sets of cameras
-python benchmarks/cameras.py --world demo:statue                        # a video of an orbit around a made world
+python benchmarks/cameras.py --world demo:statue                        # a video of an orbit around a synthetic scene
 
 Errors are those after the best similarity (Umeyama 1991): of centres as a share of the cameras' extent (the largest
 distance of one from their mean), of rotations in degrees. Seconds are those of the clock and of the processor. Nothing
@@ -40,7 +40,7 @@ from dreamcatalyst.data.views import Capture  # noqa: E402
 from dreamcatalyst.errors import DreamCatalystError  # noqa: E402
 from omegaconf import OmegaConf  # noqa: E402
 
-FRAMES, SIDE = 150, 640  # of the video of a made world
+FRAMES, SIDE = 150, 640  # of the video of a synthetic scene
 
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[float, np.ndarray]:
@@ -89,7 +89,7 @@ def show(facts: dict, found: dict[str, float]) -> None:
 
 
 def world_video(source: str, folder: Path) -> tuple[Path, dict[str, Cameras]]:
-    """A video of one turn around a made world, and the cameras by the names that its frames get."""
+    """A video of one turn around a synthetic scene, and the cameras by the names that its frames get."""
     from dreamcatalyst.demo.worlds import make_world
     from dreamcatalyst.render.api import rasterize
 
@@ -148,7 +148,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--capture", type=Path, help="a folder with photographs and cameras that are known")
-    what.add_argument("--world", help="a made world, such as demo:statue")
+    what.add_argument("--world", help="a synthetic scene, such as demo:statue")
     parser.add_argument("--photographs", type=int, metavar="N", help="so many, evenly spread")
     parser.add_argument("--first", type=int, metavar="N", help="the first so many")
     parser.add_argument("--fit", action="store_true", help="fit splats on both sets of cameras, too")

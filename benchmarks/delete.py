@@ -1,4 +1,4 @@
-"""Deletions against their truth: a thing of a made world is taken out of splats that were fitted to renders of it.
+"""Deletions against their truth: a thing of a synthetic scene is taken out of splats that were fitted to renders of it.
 
 Splats are fitted by configs/fit.yaml (kept in --folder, and fitted once); the thing is named by a box or by pictures,
 never by its rows; what comes is compared with renders of the world without it, at held-out views. The hole is what no
@@ -89,10 +89,10 @@ HEAD = (
 
 
 def fitted(world: str, folder: Path, steps: int) -> Path:
-    """Splats of a made world, by configs/fit.yaml; those of an earlier run where they are there.
+    """Splats of a synthetic scene, by configs/fit.yaml; those of an earlier run where they are there.
 
-    A made world's points are its own, also where no view sees them, and a fit would begin with what is under the thing.
-    So it begins with those that are seen, as a reconstruction would.
+    A synthetic scene's points are its own, also where no view sees them, and a fit would begin with what is under the
+    thing. So it begins with those that are seen, as a reconstruction would.
     """
     tag = f"{world.replace(':', '-')}-{steps}"
     path = folder / "fit" / tag / "save" / "last.ply"

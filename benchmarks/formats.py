@@ -1,5 +1,5 @@
 """Splat formats: size, time to write and to read, and what is lost. `python benchmarks/formats.py [splats]`: a million
-with SH degree 3 by default, a made world's statue many times over with noise of its own; `--file a.ply` takes splats of
+with SH degree 3 by default, a synthetic statue many times over with noise of its own; `--file a.ply` takes splats of
 one's own. One thread; beside the seconds that passed, in brackets, those of the processor, which other work on the
 machine does not change. PSNR of renders before and after, lowest and highest of the views (of 512 x 512 pixels).
 """

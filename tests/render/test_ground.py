@@ -1,4 +1,4 @@
-"""The surface under a pixel, against a made world whose ground is a plane at z = -0.12, and whose sky is none."""
+"""The surface under a pixel, against a synthetic scene whose ground is a plane at z = -0.12, and whose sky is none."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Things of made worlds to be put into others, and how they look in another world's light."""
+"""Things of synthetic scenes to be put into others, and how they look in another world's light."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ class AddConfig:
     """A thing that is put into the scene: at its own coordinates, or standing with its foot (the middle of its outline,
     at its lowest) at a position, or on what a pixel of a view shows."""
 
-    path: str = ""  # splats, a mesh or a point cloud; demo:<world>: the first thing of a made world
+    path: str = ""  # splats, a mesh or a point cloud; demo:<world>: the first thing of a synthetic scene
     position: Point | None = None  # of its foot, world units
     view: str | None = None  # name or number of the view whose pixel it stands on
     pixel: tuple[NonNegative, NonNegative] | None = None  # x, y from the upper left corner: pixels of the render, or
@@ -61,7 +61,7 @@ class AddConfig:
 
     @property
     def made(self) -> bool:
-        """Whether it is of a made world."""
+        """Whether it is of a synthetic scene."""
         return self.path.startswith(PREFIX)
 
     def axis(self, splats: bool, orbit_up: str) -> str:

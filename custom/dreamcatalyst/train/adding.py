@@ -107,8 +107,8 @@ class AddedEditMethod(Addition, EditMethod):
         super().load_prior()
         if self.guidance.prior.takes_truth:
             raise PriorError(
-                "system.guidance.prior_type: got one that knows the truth of a made world, which has no such thing in "
-                "it. Choose another prior, or leave the prompt empty."
+                "system.guidance.prior_type: got one that knows the truth of a synthetic scene, which has no such "
+                "thing in it. Choose another prior, or leave the prompt empty."
             )
 
     def _find_truth(self) -> None:

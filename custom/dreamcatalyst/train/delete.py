@@ -20,7 +20,7 @@ class DeleteSystem(SplatSystem):
 
     @dataclass
     class Config(SplatSystem.Config):
-        thing: str = ""  # what is taken away, in words: for the report, and to know a made world's truth
+        thing: str = ""  # what is taken away, in words: for the report, and to know a synthetic scene's truth
         mask: dict = field(default_factory=dict)  # which splats that is
         inpaint: dict = field(default_factory=dict)  # what fills the holes of single views
         heal: dict = field(default_factory=dict)  # what counts as a hole

@@ -122,7 +122,7 @@ class Adder:
 
     @torch.no_grad()
     def __call__(self, scene: Gaussians, host: World | None) -> Added:
-        """`scene` with the thing in it. host: the made world that the scene is, if it is one."""
+        """`scene` with the thing in it. host: the synthetic scene that the scene is, if it is one."""
         there = moved(self.thing.scene.to(scene.means.device), self.place(scene))
         self.warn_of_size(there)
         factors = self.light(scene, there)
