@@ -6,6 +6,7 @@ import pytest
 import torch
 from dreamcatalyst.demo.worlds import make_world
 from dreamcatalyst.scene.gaussians import PARAMETERS
+from dreamcatalyst.scene.light import plain_colors
 from dreamcatalyst.scene.ply import read_ply, write_ply
 
 from tests.train.test_runs import rows
@@ -121,3 +122,5 @@ def test_a_mesh_stands_in_the_scene(launch, tmp_path, statue):
     widths = thing.means[:, 2].sort().indices
     low, high = thing.means[widths[:400], :2].std(0).mean(), thing.means[widths[-100:], :2].std(0).mean()
     assert float(low) > 3 * float(high)  # the tip is up
+    painted, shown = torch.tensor([200.0, 60, 40]) / 255, plain_colors(thing)
+    assert bool((shown <= 1.05 * painted).all()) and float((shown / painted).amin()) < 0.8  # lit, and not over-exposed

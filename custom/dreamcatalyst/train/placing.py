@@ -203,8 +203,10 @@ class Adder:
         if config.light != "shading" or not self.thing.surface:
             return ones
         facing, seen = faced(there, around(there))
-        change = self.lamp(scene, there) - (light.lamp(there, facing, seen) if self.thing.lit else 0.0)
-        return ones * (facing @ change.to(facing)).exp()
+        lamp = self.lamp(scene, there).to(facing)
+        if self.thing.lit:
+            return ones * (facing @ (lamp - light.lamp(there, facing, seen))).exp()
+        return ones * (facing @ lamp - lamp.norm(dim=0)).exp()  # as painted where it is lit best, and darker elsewhere
 
     def lamp(self, scene: Gaussians, there: Gaussians) -> Tensor:
         """How light depends on the normal around the thing, as far as the cameras' own circle reaches."""
