@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TypeVar, no_type_check
 
 import torch
 from jaxtyping import Float, Float64
@@ -149,6 +149,7 @@ class ClosedForm(Prior):
         return row.image.edited(row.text), s
 
 
+@no_type_check  # numbers alone, asked for by the million where a spread is solved for
 def noise_slope(abar: float, spread: float) -> float:
     """k_v = sqrt(1 - abar) / (abar v^2 + 1 - abar): how fast the noise prediction of N(m, v^2) grows with x_t."""
     return (1.0 - abar) ** 0.5 / (abar * spread**2 + 1.0 - abar)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import no_type_check
 
 import torch
 from jaxtyping import Float
@@ -34,6 +35,7 @@ def _index(limit: float) -> int:
     return math.floor(limit * DDIM_STEPS + 1e-9)  # 0.29 * 100 is 28.999...
 
 
+@no_type_check  # numbers alone, asked for by the million: a check would cost tests more than the function
 def _ddim(index: int, train_steps: int) -> int:
     """t = 2 i + 1 for T = 1000, scaled and kept inside 0..T-1 for others."""
     return min(index * train_steps // DDIM_STEPS + 1, train_steps - 1)
