@@ -176,7 +176,7 @@ def carry_out(args: argparse.Namespace, config: Any, merged: Any, mode: str, sto
             snapshot(config, merged, args.config)
             if not trainer.fast_dev_run:
                 trainer.loggers = [*trainer.loggers, *system.get_loggers()]
-            if system.takes_steps:
+            if getattr(system, "takes_steps", True):
                 trainer.fit(system, datamodule=data, ckpt_path=config.resume)
                 if keeper.began is None or trainer.global_step <= keeper.began:
                     ended = "an option ended the run before (max_epochs, max_time?)."

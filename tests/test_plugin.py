@@ -273,7 +273,7 @@ def test_the_edit_runs_in_the_host_and_is_validated_and_exported_from_its_checkp
     short += ["data.source=null", "system.gs_source=given.ply"]
     done = in_host(host, "--train", *short, bare=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
-    assert "opened 3 times" in done.stdout  # where it lies, how it was fitted, and then the splats
+    assert "opened 6 times" in done.stdout  # where it lies, how it was fitted, the splats; its format before each
     (trial,) = (host / "outputs/seam").iterdir()
     assert list(trial.glob("save/**/*.ply")), sorted(trial.rglob("*"))
     (checkpoint,) = trial.glob(f"ckpts/*step={STEPS}.ckpt")

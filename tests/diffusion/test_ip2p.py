@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from dreamcatalyst.config import parse
 from dreamcatalyst.diffusion import folder as folder_module
+from dreamcatalyst.diffusion import ip2p as ip2p_module
 from dreamcatalyst.diffusion.api import PRIORS, Row
 from dreamcatalyst.diffusion.freeu import FreeUConfig
 from dreamcatalyst.diffusion.ip2p import InstructPix2Pix, Ip2pConfig, StableDiffusion
@@ -220,7 +221,7 @@ def test_no_network_is_refused_with_the_remedy(monkeypatch):
 
 def test_too_little_memory_is_refused_before_weights_are_read(models, monkeypatch):
     monkeypatch.setattr(folder_module, "free_memory", lambda device: 2**20)
-    monkeypatch.setattr(folder_module, "load", lambda *args: pytest.fail("weights were read"))
+    monkeypatch.setattr(ip2p_module, "load", lambda *args: pytest.fail("weights were read"))
     with pytest.raises(PriorError, match="weights need 0.* GiB.*Set dtype=fp16.*offload=true.*taesd"):
         InstructPix2Pix(Ip2pConfig(str(models["ip2p"])))
 

@@ -16,8 +16,16 @@ SYSTEMS = [name for name in OFFERS if name.endswith("-system")]
 PROMPT = {"prompt_processor": {"prompt": "Make it sunset"}}
 
 
+LEAST = {  # what a system cannot do without
+    "edit-system": PROMPT,
+    "delete-system": {"mask": {"kind": "box", "options": {"center": [0, 0, 0], "radius": 1}}},
+    "add-system": {"add": {"path": "demo:random:3"}},
+}
+
+
 def config(name: str, **keys) -> OmegaConf:
-    return OmegaConf.create({**(PROMPT if name.endswith("edit-system") else {}), **keys})
+    least = next((given for end, given in LEAST.items() if name.endswith(end)), {})
+    return OmegaConf.create({**least, **keys})
 
 
 @pytest.mark.parametrize("name", sorted(OFFERS))

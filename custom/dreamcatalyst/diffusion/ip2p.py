@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -301,7 +301,7 @@ class LatentDiffusion(Prior):
 
     # -- where and how the models run ---------------------------------------------------------------------------------
 
-    def _own_precision(self) -> torch.autocast:
+    def _own_precision(self) -> AbstractContextManager:
         """Switches a caller's autocast off: the models run in the precision of the config, not in the trainer's."""
         return torch.autocast(self.device.type, enabled=False)
 
