@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent / "custom"
 COMPILED = re.compile(r"^from numba import|^@njit|^@kernel", re.MULTILINE)  # numba cannot compile a checked function
 
 # Those whose annotations hold.
-FOLDERS = ("data", "scene", "render", "demo", "diffusion", "guidance", "segment", "loss", "report")
+FOLDERS = ("data", "scene", "render", "demo", "diffusion", "guidance", "segment", "inpaint", "loss", "report")
 # An int may stand for a float, and a section of OmegaConf for a dict, as in its own structured configs.
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=FrozenDict({dict: dict | DictConfig})))
 

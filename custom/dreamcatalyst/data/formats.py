@@ -34,10 +34,8 @@ class CaptureOptions:
 
     format: str | None = field(default=None, metadata={"choices": FORMATS})  # None: whichever finds its files
     images: str = "images"  # folder of the photographs in a COLMAP capture
-    masks: str = (
-        ""  # folder of pictures, <photograph>.png each, black where a fit leaves its photograph out; empty: those
-    )
-    # that the capture names itself (nerfstudio's mask_path)
+    masks: str = ""  # folder of <photograph>.png, black where a fit leaves its photograph out; empty: those that the
+    # capture names itself (nerfstudio's mask_path)
     downscale: Annotated[float, Range("[1, inf)")] = 1.0  # photographs are made smaller by this factor, at least 1
     width: Side | None = None  # pixels; with height: centred crop to their aspect, then resize
     height: Side | None = None  # pixels; width or height alone: the other follows the photograph's aspect

@@ -23,9 +23,7 @@ ROUNDS = 3  # of reweighting
 DARKEST = 0.02  # colours below count as this: their logarithm says nothing
 MOST = 20_000  # splats that are looked at
 NORM = 6.0  # Finlayson and Trezzi's
-DAYLIGHT = (
-    0.6  # that norm of pictures in good light: 0.59 of 24 synthetic ones (seeds 1000 to 1023), 0.67 of photographs
-)
+DAYLIGHT = 0.6  # that norm in good light: 0.59 of 24 synthetic scenes (seeds 1000 to 1023), 0.67 of photographs
 DOUBT = 0.15  # standard deviation of its logarithm among those worlds
 STRONGEST = 4.0  # factor by which light may change a colour, either way
 

@@ -167,11 +167,7 @@ def plain(node: Any) -> dict[str, Any]:
 def _what_counts(told: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a recipe that say what a fit becomes, wherever it runs."""
     free = [key for key in told for pattern in MAY_CHANGE if fnmatch.fnmatchcase(key, pattern)]
-    return {
-        key: value
-        for key, value in told.items()
-        if key in ("trainer.max_steps",) or key not in free and key != "data.source"
-    }
+    return {key: value for key, value in told.items() if key == "trainer.max_steps" or key not in free}
 
 
 def _content(capture: Capture) -> list[Any]:

@@ -26,6 +26,7 @@ from ..render.lift import Evidence, lift
 from ..render.surface import seen, surface_normals, surface_points, surface_splats
 from ..scene.gaussians import Gaussians
 from ..scene.mask import distances_to
+from . import region
 from .drawing import Drawer
 
 SHOWN = 0.03  # share of a pixel that was of the thing, from which on it shows something else without it
@@ -214,8 +215,7 @@ class Healing:
 
 def widened(mask: Bool[Tensor, "H W"], pixels: int) -> Bool[Tensor, "H W"]:
     """The mask and every pixel at most so many away along both axes."""
-    grown = torch.nn.functional.max_pool2d(mask[None, None].float(), 2 * pixels + 1, stride=1, padding=pixels)
-    return grown[0, 0] > 0
+    return region.widened(mask[None, ..., None].float(), pixels)[0, ..., 0] > 0
 
 
 def opened(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:

@@ -76,6 +76,10 @@ def write_mask_pictures(result: Mask, request: MaskRequest, path: Path) -> Path:
 
 def dilate(share: Tensor, reach: float) -> Tensor:
     """share [B,H,W,1] to the largest value within `reach` (a fraction of the longer side) of each pixel."""
-    pixels = round(reach * max(share.shape[1:3]))
+    return widened(share, round(reach * max(share.shape[1:3])))
+
+
+def widened(share: Tensor, pixels: int) -> Tensor:
+    """share [B,H,W,1] to the largest value at most so many pixels away along both axes."""
     grown = torch.nn.functional.max_pool2d(share.permute(0, 3, 1, 2), 2 * pixels + 1, stride=1, padding=pixels)
     return grown.permute(0, 2, 3, 1)
